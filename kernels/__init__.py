@@ -1,0 +1,60 @@
+"""What runs on the device, pure Warp: one file a physical effect, one for the solver, one for the step around it.
+
+Installed as ``warp_yarn.kernels``. A new effect is a new file with its ``TERM``, and one line here.
+"""
+
+import functools
+
+import warp as wp
+
+from . import (
+    applied,
+    bending,
+    contact,
+    friction,
+    gravity,
+    inertia,
+    parallel,
+    pins,
+    shear,
+    solver,
+    step,
+    stretch,
+    wind,
+)
+from .variant import Term, Variant
+
+__all__ = ["TERMS", "Term", "Variant", "build"]
+
+_REGISTERED = (
+    inertia.MASS,
+    inertia.INERTIA,
+    inertia.MASS_RATE,
+    stretch.TERM,
+    bending.TERM,
+    gravity.TERM,
+    parallel.TERM,
+    shear.TERM,
+    wind.TERM,
+    pins.TERM,
+    applied.TERM,
+    friction.TERM,  # last: it reads the sum of the others
+)
+TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
+
+
+@functools.cache
+def build(variant: Variant) -> dict[str, wp.Kernel]:
+    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ``stretch_contact_load``, ...
+
+    All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
+    """
+    kernels = {"contact_normal": contact.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
+    for term in TERMS.values():
+        kernels[term.name] = term.define(variant)
+        if term.energy is not None:
+            kernels[f"{term.name}_energy"] = term.energy(variant)
+        if term.contact_load is not None:
+            kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
+    kernels |= vars(step.define(variant)) | vars(solver.define(variant))
+    return kernels

@@ -1,0 +1,26 @@
+"""Forces that the user applies to nodes, which may change from step to step.
+
+Parameters: ``applied_force`` [N], of the chosen nodes in this step.
+"""
+
+import warp as wp
+
+from .variant import Term, Variant
+
+
+def define(variant: Variant) -> wp.Kernel:
+    vec3 = variant.vec3
+
+    @wp.kernel(module=variant.module("terms"))
+    def applied_term(
+        applied_node: wp.array(dtype=int),
+        applied_force: wp.array(dtype=vec3),
+        force: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        wp.atomic_add(force, applied_node[e], applied_force[e])
+
+    return applied_term
+
+
+TERM = Term(name="applied", elements="applied", define=define)

@@ -1,0 +1,141 @@
+"""Friction of warp against weft along each of the two yarns of a crossing (eq. 4).
+
+    F = −[½ (k_f δ − K(δ) μF_n) K(μF_n − |F_s|) + ½ (k_f δ + K(δ) μF_n)] − d_f ṡ,   K(z) = tanh(p z),   δ = s − s̄
+
+s̄ is the anchor, F_s the force on s of everything except friction. Stuck, K of the second argument is 1 and the force
+is the spring −k_f δ; sliding, it is −1 and the force is −μF_n sign δ. Sticking holds the anchor and sliding drags it
+along, so that k_f |δ| never exceeds μF_n.
+
+A single p for a length (~1e-6 m) and a force (~1e-4 N) makes both tanh arguments ≪ 1: with the published p = 10 the law
+neither sticks nor slips. So both are made dimensionless, δ by μF_n/k_f and forces by μF_n, with a floor under μF_n for
+slack crossings. ``published_scaling`` takes the arguments in SI units, as published.
+
+Parameters: ``friction`` μ; ``friction_stiffness`` k_f [N/m]; ``friction_damping`` d_f [N s/m];
+``friction_sharpness`` p.
+
+The matrix holds −∂F/∂δ (never negative) and d_f. What F depends on through F_n and F_s is not symmetric, and left out.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .variant import Term, Variant
+
+FLOOR = 1.0e-7
+"""Displacement, in spacings, whose spring force is the floor under μF_n: 1e-10 m for the paper's cloth, whose yarns slide
+by some 1e-6 m."""
+
+
+@functools.cache
+def functions(variant: Variant) -> SimpleNamespace:
+    scalar = variant.scalar
+    vec2 = wp.types.vector(2, scalar)
+
+    @wp.func
+    def friction_force(
+        delta: scalar,
+        others: scalar,
+        limit: scalar,
+        stiffness: scalar,
+        sharpness: scalar,
+        floor: scalar,
+        published_scaling: int,
+    ) -> vec2:
+        """(F without its damping, −∂F/∂δ); limit = μF_n."""
+        by_force = sharpness
+        by_length = sharpness
+        if published_scaling == 0:
+            scale = limit + floor
+            by_force = sharpness / scale
+            by_length = sharpness * stiffness / scale
+        sign = wp.tanh(by_length * delta)
+        stuck = wp.tanh(by_force * (limit - wp.abs(others)))
+        spring = stiffness * delta
+        half = scalar(0.5)
+        one = scalar(1.0)
+        f = -half * ((spring - sign * limit) * stuck + spring + sign * limit)
+        slope = half * stiffness * (one + stuck) + half * (one - stuck) * limit * by_length * (one - sign * sign)
+        return vec2(f, slope)
+
+    return SimpleNamespace(force=friction_force)
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3 = variant.scalar, variant.vec3
+    friction_force = functions(variant).force
+
+    @wp.kernel(module=variant.module("terms"))
+    def friction_term(
+        # topology
+        crossing_node: wp.array(dtype=int),
+        # parameters
+        friction: wp.array(dtype=scalar),
+        friction_stiffness: wp.array(dtype=scalar),
+        friction_damping: wp.array(dtype=scalar),
+        friction_sharpness: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
+        published_scaling: int,
+        # state in
+        euler: wp.array(dtype=scalar),
+        euler_velocity: wp.array(dtype=scalar),
+        anchor: wp.array(dtype=scalar),
+        contact_load: wp.array(dtype=scalar),
+        euler_force: wp.array(dtype=scalar),
+        # forces and momentum out
+        friction_force_out: wp.array(dtype=scalar),
+        euler_momentum: wp.array(dtype=scalar),
+        # matrix out
+        matrix: int,
+        weights: wp.array(dtype=vec3),
+        diagonal_ss: wp.array(dtype=scalar),
+    ):
+        i = crossing_node[wp.tid()]
+        limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
+        floor = friction_stiffness[0] * spacing[0] * scalar(wp.static(FLOOR))
+        for direction in range(2):
+            s = 2 * i + direction
+            f = friction_force(
+                euler[s] - anchor[s],
+                euler_force[s],
+                limit,
+                friction_stiffness[0],
+                friction_sharpness[0],
+                floor,
+                published_scaling,
+            )
+            friction_force_out[s] = f[0] - friction_damping[0] * euler_velocity[s]
+            if matrix != 0:
+                damping = weights[0][1] * friction_damping[0]
+                wp.atomic_add(euler_momentum, s, damping * euler_velocity[s])
+                wp.atomic_add(diagonal_ss, s, damping + weights[0][2] * f[1])
+
+    return friction_term
+
+
+def define_anchor(variant: Variant) -> wp.Kernel:
+    scalar = variant.scalar
+
+    @wp.kernel(module=variant.module("terms"))
+    def drag_anchor(
+        crossing_node: wp.array(dtype=int),
+        friction: wp.array(dtype=scalar),
+        friction_stiffness: wp.array(dtype=scalar),
+        contact_load: wp.array(dtype=scalar),
+        euler_next: wp.array(dtype=scalar),
+        anchor: wp.array(dtype=scalar),
+        anchor_next: wp.array(dtype=scalar),
+    ):
+        """s̄ after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
+        i = crossing_node[wp.tid()]
+        reach = friction[0] * wp.max(contact_load[i], scalar(0.0)) / friction_stiffness[0]
+        for direction in range(2):
+            s = 2 * i + direction
+            delta = euler_next[s] - anchor[s]
+            anchor_next[s] = euler_next[s] - wp.clamp(delta, -reach, reach)
+
+    return drag_anchor
+
+
+TERM = Term(name="friction", elements="crossings", define=define, needs_contact=True, sliding_only=True)

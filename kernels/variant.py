@@ -1,0 +1,58 @@
+"""What kernels are compiled for, and what a term has to say of itself."""
+
+import dataclasses
+from collections.abc import Callable
+
+import warp as wp
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One compilation of every kernel: the scalar type, and whether yarns slide.
+
+    Without sliding the branches under ``if wp.static(sliding)`` are not generated, so a scene that locks the
+    Eulerian coordinates pays neither for their arithmetic nor for their arrays (which are passed as ``None``).
+    """
+
+    scalar: type
+    sliding: bool
+
+    @property
+    def vec3(self) -> type:
+        return wp.types.vector(3, self.scalar)
+
+    @property
+    def mat33(self) -> type:
+        return wp.types.matrix((3, 3), self.scalar)
+
+    def module(self, name: str) -> str:
+        """Name of the Warp module that this variant's kernels of one kind are compiled into.
+
+        One module a variant: typing.Any kernels would rebuild their module at every new instantiation.
+        """
+        return f"warp_yarn_{name}_{self.scalar.__name__}_{'sliding' if self.sliding else 'locked'}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """One physical effect, as the simulator sees it.
+
+    A kernel's arguments are found by name among the simulator's arrays (``warp_yarn.arrays``), so a kernel says
+    itself what it reads and writes.
+    """
+
+    name: str
+    elements: str
+    """What the kernel runs over: nodes, crossings, segments, bends, corners, triangles or pins."""
+    define: Callable[[Variant], wp.Kernel]
+    energy: Callable[[Variant], wp.Kernel] | None = None
+    """The kernel that adds up the term's energy, where it has one."""
+    stencil: int = 0
+    """Neighbours that the term couples in the matrix: 0 none, 2 the next crossings of each yarn, 4 the second
+    next as well, 6 the diagonal ones as well."""
+    needs_contact: bool = False
+    """Whether the term reads the contact force of every crossing."""
+    sliding_only: bool = False
+    """Whether the term vanishes identically where yarns do not slide."""
+    contact_load: Callable[[Variant], wp.Kernel] | None = None
+    """The kernel that adds what this term presses crossings together with (eq. 3), where it does."""

@@ -1,0 +1,155 @@
+"""A scene's arrays on the device, named as the kernels' arguments name them.
+
+What a scene does not use is None: without sliding there is nothing of the Eulerian coordinates but their fixed rest
+values, without shear and friction nothing of the contact, and so on.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .cloth import Cloth
+from .kernels import TERMS, Term, Variant
+from .scene import Scene
+from .state import CLOTH_NUMBERS
+
+YARN_PARAMETERS = ("density", "stretch", "bend")
+
+STATE_TYPES = {"position": 3, "euler": 2, "velocity": 3, "euler_velocity": 2, "anchor": 2}
+"""Numbers a node has in each array of the state."""
+
+
+class Arrays(dict[str, Any]):
+    """Everything that kernels of a scene are launched with: arrays, and the two counts that they need."""
+
+    def __init__(self, scene: Scene, variant: Variant, device: Any):
+        super().__init__()
+        self.scene, self.variant, self.device = scene, variant, device
+        self.terms: list[Term] = [TERMS[name] for name in scene.terms]
+        self.contact = any(term.needs_contact for term in self.terms)
+        self.stencil = max(term.stencil for term in self.terms)
+        self._topology(scene.cloth)
+        self._parameters(scene)
+        self._state()
+        self._work()
+        self.dims = {
+            "nodes": self["nodes"],
+            "segments": len(self["segment_nodes"]),
+            "bends": len(self["bend_nodes"]),
+            "crossings": len(self["crossing_node"]),
+            "corners": len(self["corner_nodes"]) if self["corner_nodes"] is not None else 0,
+            "triangles": len(self["triangle_nodes"]) if self["triangle_nodes"] is not None else 0,
+            "pins": len(scene.pins),
+            "applied": len(scene.force_nodes),
+        }
+
+    def zeros(self, count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=self.device)
+
+    def numbers(self, values: Any) -> wp.array:
+        """A parameter: an array of the variant's scalars, or of its vectors where values has a second axis of 3."""
+        values = np.atleast_1d(np.asarray(values, dtype=np.float64))
+        dtype = self.variant.vec3 if values.ndim == 2 else self.variant.scalar
+        return wp.array(values.astype(wp.dtype_to_numpy(self.variant.scalar)), dtype=dtype, device=self.device)
+
+    def _topology(self, cloth: Cloth) -> None:
+        topology = cloth.topology
+        used = {term.elements for term in self.terms}
+        skipped = {"corners": "corner_", "triangles": "triangle_"}
+        skipped = tuple(prefix for elements, prefix in skipped.items() if elements not in used)
+        vectors = {1: wp.int32, 2: wp.vec2i, 3: wp.vec3i, 4: wp.vec4i}
+        for name, values in vars(topology).items():
+            if name == "neighbour":
+                values = np.ascontiguousarray(values[:, : self.stencil]).ravel()
+            if not isinstance(values, np.ndarray):
+                continue
+            dtype = vectors[1 if values.ndim == 1 else values.shape[1]]
+            self[name] = None if name.startswith(skipped) else wp.array(values, dtype=dtype, device=self.device)
+        free = np.ones(topology.nodes, dtype=np.int32)
+        if self.scene.pin_stiffness is None:
+            free[self.scene.pins] = 0
+        self["is_free"] = wp.array(free, dtype=wp.int32, device=self.device)
+        self["nodes"], self["stencil"] = topology.nodes, self.stencil
+
+    def _parameters(self, scene: Scene) -> None:
+        cloth = scene.cloth
+        for name in YARN_PARAMETERS:
+            self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
+        for name in CLOTH_NUMBERS:
+            self[name] = self.numbers(getattr(cloth, name))
+        if scene.gravity is not None:
+            self["gravity"] = self.numbers(scene.gravity[None])
+        if scene.wind is not None:
+            self["wind_velocity"] = self.numbers(np.asarray(scene.wind.velocity)[None])
+            self["wind_density"] = self.numbers(scene.wind.density)
+            self["wind_drag"] = self.numbers(scene.wind.drag)
+        if len(scene.pins):
+            wanted = cloth.position[scene.pins] if scene.pin_path is None else scene.pin_path[0]
+            self["pin_node"] = wp.array(scene.pins, dtype=wp.int32, device=self.device)
+            self["pin_target"] = self.numbers(wanted)
+            if scene.pin_stiffness is not None:
+                self["pin_stiffness"] = self.numbers(scene.pin_stiffness)
+        if len(scene.force_nodes):
+            self["applied_node"] = wp.array(scene.force_nodes, dtype=wp.int32, device=self.device)
+            self["applied_force"] = self.numbers(scene.force_path[0])
+        self["published_scaling"] = int(scene.published_scaling)
+
+    def _state(self) -> None:
+        n, scalar, vec3 = self["nodes"], self.variant.scalar, self.variant.vec3
+        friction = any(term.name == "friction" for term in self.terms)
+        for name, width in STATE_TYPES.items():
+            stored = {"euler_velocity": self.variant.sliding, "anchor": friction}.get(name, True)
+            dtype, count = (vec3, n) if width == 3 else (scalar, 2 * n)
+            self[name] = self.zeros(count, dtype) if stored else None
+
+    def _work(self) -> None:
+        n, scalar, vec3, mat33 = self["nodes"], self.variant.scalar, self.variant.vec3, self.variant.mat33
+        sliding = self.variant.sliding
+        self["normal"] = self.zeros(n, vec3) if self.contact else None
+        self["contact_load"] = self.zeros(n, scalar) if self.contact else None
+        for name in ("force", "momentum", "rhs", "solution", "r_x", "p_x", "q_x", "t_x", "inverse_x"):
+            self[name] = self.zeros(n, vec3)
+        for name in (
+            "euler_force",
+            "euler_momentum",
+            "euler_rhs",
+            "euler_solution",
+            "r_s",
+            "p_s",
+            "q_s",
+            "t_s",
+            "inverse_s",
+        ):
+            self[name] = self.zeros(2 * n, scalar) if sliding else None
+        self["friction_force_out"] = self.zeros(2 * n, scalar) if self["anchor"] is not None else None
+        self["diagonal_xx"] = self.zeros(n, mat33)
+        self["pivot"] = self.zeros(n, mat33)
+        self["inverse_pivot"] = self.zeros(n, mat33)
+        self["upper_xx"] = self.zeros(self.stencil * n, mat33)
+        for name, count, dtype in (
+            ("diagonal_xs", 2 * n, vec3),
+            ("diagonal_ss", 2 * n, scalar),
+            ("upper_xs", 4 * n, vec3),
+            ("upper_sx", 4 * n, vec3),
+            ("upper_ss", 4 * n, scalar),
+        ):
+            self[name] = self.zeros(count, dtype) if sliding else None
+        self["status"] = self.zeros(2, wp.int32)
+        self["iterations"] = self.zeros(1, wp.int32)
+        self["residual"] = self.zeros(1, scalar)
+        self["weights"] = self.zeros(1, vec3)
+        self["step_size"] = self.zeros(1, scalar)
+
+    def zero(self, *names: str) -> None:
+        """Sets arrays to 0, those that the scene has."""
+        for name in names:
+            if self[name] is not None:
+                self[name].zero_()
+
+    def launch(self, kernel: wp.Kernel, elements: str | int, **replaced: Any) -> None:
+        """Launches a kernel over elements, its arguments found by their names."""
+        dim = self.dims[elements] if isinstance(elements, str) else elements
+        if dim:
+            inputs = [replaced[a.label] if a.label in replaced else self[a.label] for a in kernel.adj.args]
+            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)

@@ -1,0 +1,90 @@
+"""What can go wrong, as exceptions that say where, with which value, and what is allowed."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+
+class WarpYarnError(Exception):
+    """Every error that warp_yarn raises on purpose."""
+
+
+class InputError(WarpYarnError, ValueError):
+    """An argument or a file that cannot be used. The message names it, its value and what is allowed."""
+
+
+class SimulationError(WarpYarnError, RuntimeError):
+    """A step that could not be made.
+
+    Attributes:
+        step: number of the step, counted from 1 in this run.
+        node: index of the node (column + row·columns), or -1 where no single node is to blame.
+        term: name of the term that is largest or not finite there, or None.
+        trajectory: the frames before it, ready to be written.
+    """
+
+    def __init__(self, message: str, *, step: int, node: int, term: str | None, trajectory: Any):
+        super().__init__(message)
+        self.step, self.node, self.term, self.trajectory = step, node, term, trajectory
+
+
+def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """value as a new float64 array of the shape (None: any length), or an InputError."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
+    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        raise InputError(f"{name} has shape {array.shape}, must be {wanted}")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(f"{name}{list(where)} is {array[where]}, must be finite")
+    return array
+
+
+def number(name: str, value: Any, *, above: float | None = None, least: float | None = None) -> float:
+    """value as a finite float in the open (above) or closed (least) range, or an InputError."""
+    allowed = "finite"
+    if above is not None:
+        allowed = f"finite and above {above:g}"
+    if least is not None:
+        allowed = f"finite and at least {least:g}"
+    try:
+        result = float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} = {value!r}, must be a number, {allowed}") from error
+    if not np.isfinite(result) or (above is not None and result <= above) or (least is not None and result < least):
+        raise InputError(f"{name} = {value!r}, must be {allowed}")
+    return result
+
+
+def whole(name: str, value: Any, *, least: int) -> int:
+    """value as an int of at least `least`, or an InputError."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} = {value!r}, must be a whole number, at least {least}")
+    return int(value)
+
+
+def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
+    """value, or an InputError where it is none of the allowed names."""
+    names = list(allowed)
+    if value not in names:
+        raise InputError(f"{name} = {value!r}, must be one of {', '.join(names)}")
+    return value
+
+
+def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:
+    """value as an int32 array of distinct indices below count, or an InputError."""
+    array = np.atleast_1d(np.asarray(value))
+    if array.size == 0:
+        return np.zeros(0, dtype=np.int32)
+    if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
+        raise InputError(f"{name} = {value!r}, must be a list of whole numbers, the {what}")
+    outside = array[(array < 0) | (array >= count)]
+    if outside.size:
+        raise InputError(f"{name} names {what} {int(outside[0])}, must be from 0 to {count - 1}")
+    if len(np.unique(array)) != len(array):
+        raise InputError(f"{name} names a {what} twice: {array.tolist()}")
+    return array.astype(np.int32)
