@@ -8,11 +8,13 @@ import functools
 import warp as wp
 
 from . import (
+    adjoint,
     applied,
     bending,
     contact,
     friction,
     gravity,
+    history,
     inertia,
     parallel,
     pins,
@@ -56,5 +58,6 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant)
         if term.contact_load is not None:
             kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
-    kernels |= vars(step.define(variant)) | vars(solver.define(variant))
+    for part in (step, solver, history, adjoint):
+        kernels |= vars(part.define(variant))
     return kernels

@@ -24,8 +24,8 @@ import warp as wp
 from .variant import Term, Variant
 
 FLOOR = 1.0e-7
-"""Displacement, in spacings, whose spring force is the floor under μF_n: 1e-10 m for the paper's cloth, whose yarns slide
-by some 1e-6 m."""
+"""Displacement, in spacings, whose spring force is the floor under μF_n: 1e-10 m for the paper's cloth,
+whose yarns slide by some 1e-6 m."""
 
 
 @functools.cache

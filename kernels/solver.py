@@ -25,7 +25,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .step import NOT_CONVERGED
+from .step import NOT_CONVERGED, NOT_FINITE
 from .variant import Variant
 
 
@@ -94,6 +94,29 @@ def define(variant: Variant) -> SimpleNamespace:
                 q_s[2 * i] = y_u
                 q_s[2 * i + 1] = y_v
             q_x[i] = y
+
+    @wp.kernel(module=module, enable_backward=False)
+    def apply_matrix(
+        nodes: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        diagonal_xx: wp.array(dtype=mat33),
+        diagonal_xs: wp.array(dtype=vec3),
+        diagonal_ss: wp.array(dtype=scalar),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        p_x: wp.array(dtype=vec3),
+        p_s: wp.array(dtype=scalar),
+        q_x: wp.array(dtype=vec3),
+        q_s: wp.array(dtype=scalar),
+    ):
+        """q += A p."""
+        multiply(
+            nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
+            upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
+        )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
     def jacobi_conjugate_gradient(
@@ -168,7 +191,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     q_s[s] = zero
 
         limit = tolerance * tolerance * size
-        count = 0
+        count = int(0)
         while count < most_iterations and rz > limit:
             multiply(
                 nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
@@ -209,7 +232,7 @@ def define(variant: Variant) -> SimpleNamespace:
         iterations[0] = count
         residual[0] = wp.sqrt(wp.max(rz, zero) / wp.max(size, scalar(1.0e-30)))
         if not (rz <= limit) and status[0] == 0:
-            status[0] = wp.static(NOT_CONVERGED)
+            status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
             worst = scalar(-1.0)
             for i in range(nodes):
                 here = wp.dot(r_x[i], wp.cw_mul(inverse_x[i], r_x[i]))
@@ -434,7 +457,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 r_s[2 * i + 1] = r_v
 
         limit = tolerance * tolerance * size
-        count = 0
+        count = int(0)
         while count < most_iterations and rz > limit:
             backward_sweep(
                 nodes, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss,
@@ -500,7 +523,7 @@ def define(variant: Variant) -> SimpleNamespace:
         iterations[0] = count
         residual[0] = wp.sqrt(wp.max(rz, zero) / wp.max(size, scalar(1.0e-30)))
         if not (rz <= limit) and status[0] == 0:
-            status[0] = wp.static(NOT_CONVERGED)
+            status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
             worst = scalar(-1.0)
             for i in range(nodes):
                 here = wp.dot(r_x[i], pivot[i] * r_x[i])
@@ -509,6 +532,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     status[1] = i
 
     return SimpleNamespace(
+        apply_matrix=apply_matrix,
         factorize=factorize,
         jacobi_conjugate_gradient=jacobi_conjugate_gradient,
         incomplete_conjugate_gradient=incomplete_conjugate_gradient,

@@ -13,7 +13,7 @@ import warp as wp
 from .variant import Variant
 
 NOT_FINITE, ORDER_LOST, NOT_CONVERGED = 1, 2, 3
-"""What went wrong in a step, in ``status[0]``; ``status[1]`` is the node."""
+"""What went wrong in a step, in ``status[0]``; ``status[1]`` is the node, ``status[2]`` the step of its chunk."""
 
 
 @functools.cache
@@ -67,7 +67,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 else:
                     inverse_s[s] = scalar(0.0)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def prescribe(
         pin_node: wp.array(dtype=int),
         pin_target: wp.array(dtype=vec3),

@@ -1,7 +1,7 @@
 """Differentiable simulation of woven fabric, yarn by yarn."""
 
 from .cloth import Cloth, Yarn
-from .errors import InputError, SimulationError, WarpYarnError
+from .errors import GradientError, InputError, SimulationError, WarpYarnError
 from .scene import Scene, Wind
 from .simulator import Simulator
 from .state import State, Trajectory
@@ -10,6 +10,7 @@ from .weave import WEAVES, Weave
 __all__ = [
     "WEAVES",
     "Cloth",
+    "GradientError",
     "InputError",
     "Scene",
     "SimulationError",

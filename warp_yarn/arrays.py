@@ -88,11 +88,15 @@ class Arrays(dict[str, Any]):
             wanted = cloth.position[scene.pins] if scene.pin_path is None else scene.pin_path[0]
             self["pin_node"] = wp.array(scene.pins, dtype=wp.int32, device=self.device)
             self["pin_target"] = self.numbers(wanted)
+            if scene.pin_path is not None:
+                self["pin_target_path"] = self.numbers(scene.pin_path.reshape(-1, 3))
             if scene.pin_stiffness is not None:
                 self["pin_stiffness"] = self.numbers(scene.pin_stiffness)
         if len(scene.force_nodes):
             self["applied_node"] = wp.array(scene.force_nodes, dtype=wp.int32, device=self.device)
             self["applied_force"] = self.numbers(scene.force_path[0])
+            if len(scene.force_path) > 1:
+                self["applied_force_path"] = self.numbers(scene.force_path.reshape(-1, 3))
         self["published_scaling"] = int(scene.published_scaling)
 
     def _state(self) -> None:
@@ -135,7 +139,8 @@ class Arrays(dict[str, Any]):
             ("upper_ss", 4 * n, scalar),
         ):
             self[name] = self.zeros(count, dtype) if sliding else None
-        self["status"] = self.zeros(2, wp.int32)
+        self["status"] = self.zeros(3, wp.int32)
+        self["counters"] = self.zeros(2, wp.int32)
         self["iterations"] = self.zeros(1, wp.int32)
         self["residual"] = self.zeros(1, scalar)
         self["weights"] = self.zeros(1, vec3)
@@ -151,5 +156,18 @@ class Arrays(dict[str, Any]):
         """Launches a kernel over elements, its arguments found by their names."""
         dim = self.dims[elements] if isinstance(elements, str) else elements
         if dim:
-            inputs = [replaced[a.label] if a.label in replaced else self[a.label] for a in kernel.adj.args]
+            inputs = [replaced[a.label] if a.label in replaced else self.find(a.label) for a in kernel.adj.args]
             wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def find(self, label: str) -> Any:
+        """What a kernel's argument of this name stands for; ``x_grad`` is the gradient of ``x``."""
+        if label.endswith("_grad"):
+            array = self[label.removesuffix("_grad")]
+            return None if array is None else array.grad
+        return self[label]
+
+    def add_frames(self, count: int) -> None:
+        """Makes room for so many frames of the state, as ``frame_position`` and so on."""
+        for name in STATE_TYPES:
+            array = self[name]
+            self[f"frame_{name}"] = None if array is None else self.zeros(count * array.shape[0], array.dtype)

@@ -29,6 +29,19 @@ class SimulationError(WarpYarnError, RuntimeError):
         self.step, self.node, self.term, self.trajectory = step, node, term, trajectory
 
 
+class GradientError(WarpYarnError, RuntimeError):
+    """A gradient that could not be computed.
+
+    Attributes:
+        step: number of the step, counted from 1 in this run; 0 is the initial state.
+        term: the kernel whose reverse is to blame, or None.
+    """
+
+    def __init__(self, message: str, *, step: int, term: str | None):
+        super().__init__(message)
+        self.step, self.term = step, term
+
+
 def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     """value as a new float64 array of the shape (None: any length), or an InputError."""
     try:

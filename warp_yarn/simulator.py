@@ -20,6 +20,10 @@ MATRIX = (
 )  # fmt: skip
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 PRECONDITIONERS = ("incomplete", "jacobi")
+PATHS = ("pin_target", "applied_force")
+"""Inputs that may change from step to step."""
+CHUNK_BYTES = 1 << 24
+"""Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
 PRECISIONS = {"double": wp.float64, "single": wp.float32}
 
 
@@ -34,8 +38,11 @@ class Simulator:
         tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the matrix' diagonal.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
 
+        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
+
     Attributes:
         state: the present state; set it to start from another one.
+        steps_done: steps since the beginning, by which moving pins and applied forces are looked up.
         arrays: the scene's arrays on the device, by the names that kernels use.
     """
 
@@ -49,6 +56,7 @@ class Simulator:
         preconditioner: str = "incomplete",
         tolerance: float | None = None,
         max_iterations: int | None = None,
+        chunk: int | None = None,
     ):
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {scene!r}, must be a Scene")
@@ -73,8 +81,13 @@ class Simulator:
         h = self.step_size
         self.arrays["weights"].assign(np.array([[1.0, h, h * h]]))
         self.arrays["step_size"].assign(np.array([h]))
+        self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
         self._graph: Any = None
-        self._steps_done = 0
+        self.steps_done = 0
+        self.chunk = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
+        if chunk is not None:
+            self.chunk = whole("chunk", chunk, least=1)
+        self.arrays.add_frames(self.chunk + 1)
         self.state = self._rest()
 
     # -- state -------------------------------------------------------------------------------------------------------
@@ -149,49 +162,80 @@ class Simulator:
                 if term.contact_load is not None:
                     a.launch(self.kernels[f"{term.name}_contact_load"], term.elements)
 
-    def _solve(self) -> None:
+    def prescribe(self) -> None:
+        """Gives exact pins the velocity that brings them to their place."""
+        if self.held:
+            self.arrays.launch(self.kernels["prescribe"], "pins")
+
+    def solve(self, **replaced: Any) -> None:
+        """Launches the conjugate gradient on the assembled system, with other vectors where they are given."""
         a = self.arrays
         a.launch(self.kernels["precondition"], "nodes")
         if self.preconditioner == "incomplete":
             a.launch(self.kernels["factorize"], 1)
-        # The last velocity is the start: a step changes it little.
-        wp.copy(a["solution"], a["velocity"])
-        if self.scene.sliding:
-            wp.copy(a["euler_solution"], a["euler_velocity"])
-        if len(self.scene.pins) and self.scene.pin_stiffness is None:
-            a.launch(self.kernels["prescribe"], "pins")
         a.launch(
             self.kernels[f"{self.preconditioner}_conjugate_gradient"],
             1,
             tolerance=self.tolerance,
             most_iterations=self.max_iterations,
+            **replaced,
         )
 
-    def _advance(self) -> None:
+    def _step(self) -> None:
         a = self.arrays
+        self.take_inputs()
+        self.assemble()
+        # The last velocity is the start: a step changes it little.
+        wp.copy(a["solution"], a["velocity"])
+        if self.scene.sliding:
+            wp.copy(a["euler_solution"], a["euler_velocity"])
+        self.prescribe()
+        self.solve()
         a.launch(self.kernels["advance"], "nodes")
         if self.scene.sliding:
             a.launch(self.kernels["check_order"], "segments")
         if a["anchor"] is not None:
-            a.launch(self.kernels["drag_anchor"], "crossings", euler_next=a["euler"], anchor_next=a["anchor"])
+            self.drag_anchor("euler", "anchor")
 
-    def _replay(self) -> None:
-        """One step, captured at the first call: replayed, its twenty launches cost microseconds."""
-        if self._graph is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self.assemble()
-                self._solve()
-                self._advance()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+    def drag_anchor(self, euler: str, anchor: str) -> None:
+        """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
+        a = self.arrays
+        a.launch(self.kernels["drag_anchor"], "crossings", euler_next=a[euler], anchor_next=a[anchor])
 
-    def _set_inputs(self) -> None:
+    def take_inputs(self) -> None:
         """Puts this step's pins and applied forces in place, where they change."""
-        scene, k = self.scene, self._steps_done
-        if scene.pin_path is not None and k < len(scene.pin_path):
-            self.arrays["pin_target"].assign(scene.pin_path[k])
-        if k < len(scene.force_path) and len(scene.force_nodes):
-            self.arrays["applied_force"].assign(scene.force_path[k])
+        for name in PATHS:
+            if f"{name}_path" in self.arrays:
+                path, values = self.arrays[f"{name}_path"], self.arrays[name]
+                self.arrays.launch(self.kernels["take"], len(values), path=path, values=values)
+
+    def _capture_step(self) -> Any:
+        """One step and its record as a graph: replayed, its twenty launches cost microseconds."""
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            self._step()
+            self.arrays.launch(self.kernels["count"], 1, by=1)
+            self.arrays.launch(self.kernels["record"], "nodes")
+        return capture.graph
+
+    def run_chunk(self, steps: int) -> int:
+        """Makes at most ``chunk`` steps, into the frames on the device; the state is frame 0.
+
+        Returns:
+            How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
+        """
+        if self._graph is None:
+            self._graph = self._capture_step()
+        self.arrays["counters"].assign(np.array([0, self.steps_done], dtype=np.int32))
+        self.arrays.launch(self.kernels["record"], "nodes")
+        status = self.arrays["status"].numpy() if self.device.is_cpu else np.zeros(1)
+        for _ in range(steps):
+            wp.capture_launch(self._graph)
+            if status[0]:  # on the CPU the array itself; elsewhere looking would wait for every step
+                break
+        status = self.arrays["status"].numpy()
+        made = int(status[2]) - 1 if status[0] else steps
+        self.steps_done += made
+        return made
 
     # -- running -----------------------------------------------------------------------------------------------------
 
@@ -203,34 +247,45 @@ class Simulator:
                 last of them.
         """
         steps = whole("steps", steps, least=0)
-        cloth = self.scene.cloth
-        frames = {name: np.empty((steps + 1, cloth.nodes, width)) for name, width in STATE_TYPES.items()}
-        trajectory = Trajectory(cloth, self.step_size, **frames)
-        start = self.state
-        for name in FIELDS:
-            # What the scene does not store does not change.
-            frames[name][: 1 if self._stored(name) else steps + 1] = getattr(start, name)
-        if not self.scene.sliding:
-            frames["euler"][:] = start.euler
-        moving = [name for name in FIELDS if self._stored(name) and (name != "euler" or self.scene.sliding)]
-        status = self.arrays["status"]
-        with tqdm.trange(1, steps + 1, disable=not progress, unit="step", leave=False) as bar:
-            for k in bar:
-                self._set_inputs()
-                self._replay()
-                code, node = status.numpy()
-                if code:
-                    self._fail(int(code), int(node), k, trajectory.cut(k))
-                for name in moving:
-                    frames[name][k] = self.arrays[name].numpy().reshape(cloth.nodes, -1)
-                self._steps_done += 1
+        trajectory = self._room(steps + 1)
+        done = 0
+        with tqdm.tqdm(total=steps, disable=not progress, unit="step", leave=False) as bar:
+            while done < steps:
+                asked = min(self.chunk, steps - done)
+                made = self.run_chunk(asked)
+                self._copy_frames(trajectory, done, made + 1)
+                done += made
+                bar.update(made)
+                if made < asked:
+                    self.fail(done + 1, trajectory.cut(done + 1))
         return trajectory
 
-    def _stored(self, name: str) -> bool:
-        return self.arrays[name] is not None
+    def _room(self, frames: int) -> Trajectory:
+        """A trajectory whose frames all hold the present state."""
+        start = self.state
+        repeated = {name: np.repeat(getattr(start, name)[None], frames, axis=0) for name in FIELDS}
+        return Trajectory(self.scene.cloth, self.step_size, **repeated)
 
-    def _fail(self, code: int, node: int, k: int, trajectory: Trajectory) -> None:
+    def _copy_frames(self, trajectory: Trajectory, at: int, count: int) -> None:
+        """Copies the first frames of the chunk on the device to where they belong."""
+        for name in FIELDS:
+            if self.moves(name):
+                kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                getattr(trajectory, name)[at : at + count] = kept[:count]
+
+    def chunk_trajectory(self, frames: int) -> Trajectory:
+        """The first frames of the chunk that the device holds."""
+        trajectory = self._room(frames)
+        self._copy_frames(trajectory, 0, frames)
+        return trajectory
+
+    def moves(self, name: str) -> bool:
+        """Whether this part of the state changes in this scene."""
+        return self.arrays[name] is not None and (name != "euler" or self.scene.sliding)
+
+    def fail(self, k: int, trajectory: Trajectory) -> None:
         """Goes back to the last good frame and says what happened after it."""
+        code, node = (int(value) for value in self.arrays["status"].numpy()[:2])
         residual = float(self.arrays["residual"].numpy()[0])
         iterations = int(self.arrays["iterations"].numpy()[0])
         self.arrays.zero("status")

@@ -1,0 +1,372 @@
+"""Gradients of whole runs against central differences, for every input that a run takes."""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+import warp_yarn as wy
+import warp_yarn.torch as wt
+
+YARNS = [wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4), wy.Yarn(density=2.5e-3, stretch=1.7e5, bend=1.1e-4)]
+WIND = wy.Wind(velocity=(0.3, 5.0, -0.2))
+EXACT = 1e-14
+"""Solver tolerance where digits count: the solve then ends at rounding."""
+
+
+def cloth(rows: int = 4, columns: int = 5, weave: str = "plain", **options: float) -> wy.Cloth:
+    return wy.Cloth(wy.WEAVES[weave](rows=rows, columns=columns), yarns=YARNS, **options)
+
+
+def jittered(cloth: wy.Cloth, sliding: bool = True) -> dict[str, torch.Tensor]:
+    """A state away from every kink: bent, sheared, stretched and slack, moving and sliding."""
+    random = np.random.default_rng(3)
+    crossing = (cloth.topology.is_crossing != 0)[:, None]
+    nodes = cloth.nodes
+    state = {
+        "position": cloth.position + 1e-4 * random.standard_normal((nodes, 3)),
+        "velocity": 0.05 * random.standard_normal((nodes, 3)),
+    }
+    if sliding:
+        state["euler"] = cloth.euler + 5e-5 * crossing * random.standard_normal((nodes, 2))
+        state["euler_velocity"] = 0.01 * crossing * random.standard_normal((nodes, 2))
+        state["anchor"] = state["euler"] + 2e-8 * random.standard_normal((nodes, 2))
+    return {name: torch.tensor(value) for name, value in state.items()}
+
+
+def scaled(rollout: wt.Rollout, names: tuple[str, ...], fixed: dict[str, torch.Tensor]) -> tuple[Callable, list]:
+    """A run as a function of inputs near 1, so that one difference step suits them all, and those inputs."""
+    shapes = rollout.inputs
+    start, scales = [], []
+    for name in names:
+        value = fixed.get(name)
+        if value is None and name in ("density", "stretch", "bend"):
+            value = torch.tensor([getattr(yarn, name) for yarn in YARNS], dtype=torch.float64)
+        elif value is None:
+            value = rollout.defaults[name.removeprefix("yarn_")]
+        scale = {"euler": 1e-4, "anchor": 1e-7, "position": 1e-4, "velocity": 0.1, "euler_velocity": 0.01}.get(
+            name, float(value.abs().max()) or 1.0
+        )
+        assert tuple(value.shape) == shapes[name]
+        start.append((value / scale).detach().clone().requires_grad_())
+        scales.append(scale)
+
+    def function(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        given = {name: x * scale for name, x, scale in zip(names, inputs, scales, strict=True)}
+        frames = rollout(**{**fixed, **given})
+        return frames.position / 1e-4, frames.euler / 1e-4, frames.velocity / 0.1, frames.euler_velocity / 0.01
+
+    return function, start
+
+
+GROUPS = {
+    "materials": ("density", "stretch", "bend"),
+    "every yarn": ("yarn_density", "yarn_stretch", "yarn_bend"),
+    "crossings": (
+        "shear", "friction", "friction_stiffness", "friction_damping", "friction_sharpness", "parallel_stiffness",
+    ),
+    "surroundings": ("gravity", "wind_velocity", "wind_density", "wind_drag"),
+    "forces": ("forces", "pin_stiffness", "pin_path"),
+    # friction's anchors go with (u, v) here, as at the start of a run; alone, they are a group of their own
+    "initial state": ("position", "euler", "velocity", "euler_velocity"),
+    "anchors": ("anchor",),
+}  # fmt: skip
+
+
+def scene_for(group: str, steps: int, *, sliding: bool = True, stiffness: float | None = 100.0) -> wy.Scene:
+    # Damping far under the paper's, so that friction decides how far yarns slide and its gradients are above rounding.
+    fabric = cloth(friction_damping=0.1)
+    random = np.random.default_rng(5)
+    options = {}
+    if group in ("forces", "exact pins"):
+        pins = fabric.corners("top")
+        options["pin_path"] = fabric.position[pins] + 1e-4 * random.standard_normal((steps, 2, 3))
+        options["forces"] = {7: 1e-4 * random.standard_normal((max(steps - 1, 1), 3)), 12: 1e-4 * np.ones(3)}
+    return wy.Scene(fabric, wind=WIND, pins=fabric.corners("top"), pin_stiffness=stiffness, sliding=sliding, **options)
+
+
+def gradcheck(function: Callable, inputs: list[torch.Tensor]) -> bool:
+    # On numbers near 1, a difference step of 1e-6 leaves some 1e-6 of rounding and (seen by varying it) of curvature.
+    return torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize("group", GROUPS)
+def test_gradcheck(group: str, steps: int) -> None:
+    rollout = wt.Rollout(scene_for(group, steps), steps, frames=[steps], tolerance=EXACT)
+    fixed = jittered(rollout.scene.cloth)
+    if group == "initial state":
+        del fixed["anchor"]
+    assert gradcheck(*scaled(rollout, GROUPS[group], fixed))
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_gradcheck_exact_pins(steps: int) -> None:
+    rollout = wt.Rollout(scene_for("exact pins", steps, stiffness=None), steps, frames=[steps], tolerance=EXACT)
+    function, inputs = scaled(rollout, ("pin_path", "stretch", "position"), jittered(rollout.scene.cloth))
+    assert gradcheck(function, inputs)
+
+
+def test_gradcheck_locked() -> None:
+    rollout = wt.Rollout(scene_for("locked", 3, sliding=False), 3, frames=[3], tolerance=EXACT)
+    fixed = jittered(rollout.scene.cloth, sliding=False)
+    names = ("density", "stretch", "bend", "shear", "wind_velocity", "position", "velocity", "euler")
+    function, inputs = scaled(rollout, names, fixed)
+    assert gradcheck(function, inputs)
+
+
+def richardson(function: Callable[[float], float], x: float, scale: float) -> tuple[float, float]:
+    """Derivative by central differences, extrapolated, at the step where it agrees best with itself; and its error."""
+    best = (0.0, np.inf)
+    for step in scale * np.array([0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4]):
+        table = [[(function(x + h) - function(x - h)) / (2.0 * h) for h in (step, step / 2, step / 4)]]
+        for m in (1, 2):
+            coarse = table[-1]
+            table.append([(4**m * b - a) / (4**m - 1) for a, b in itertools.pairwise(coarse)])
+            for k, value in enumerate(table[-1]):
+                error = max(abs(value - coarse[k]), abs(value - coarse[k + 1]))
+                if error < best[1]:
+                    best = (value, error)
+    return best
+
+
+def hung(friction: float, friction_damping: float) -> tuple[wt.Rollout, dict[str, torch.Tensor]]:
+    """The hung 6 × 6 twill of 50 steps, and every number of it."""
+    fabric = cloth(6, 6, "twill", friction=friction, friction_damping=friction_damping)
+    scene = wy.Scene(fabric, wind=wy.Wind(velocity=(0.0, 5.0, 0.0)), pins=fabric.corners("top"))
+    rollout = wt.Rollout(scene, 50, tolerance=EXACT)
+    values = {name: rollout.defaults[name] for name in (*wt.NUMBERS, *wt.VECTORS)}
+    for name in ("density", "stretch", "bend"):
+        values[name] = torch.tensor([getattr(yarn, name) for yarn in YARNS], dtype=torch.float64)
+    return rollout, values
+
+
+OF_SLIDING = ("friction", "friction_stiffness", "friction_damping", "friction_sharpness", "parallel_stiffness")
+
+
+@pytest.mark.parametrize("slippery", [False, True], ids=["the paper's cloth", "a slippery cloth"])
+def test_every_parameter_of_the_hung_cloth(slippery: bool) -> None:
+    # On the paper's cloth sliding moves positions by less than differences can resolve, so what rules sliding is
+    # differentiated where yarns slide farther, and the rest where no crossing passes friction's kinks.
+    rollout, values = hung(0.5, 0.1) if slippery else hung(0.5, 1000.0)
+    names = [name for name in values if (name in OF_SLIDING) == slippery]
+    weights = torch.randn(51, 36, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    rest = torch.tensor(rollout.scene.cloth.position)
+
+    def loss(inputs: dict[str, torch.Tensor]) -> torch.Tensor:
+        return (weights * (rollout(**inputs).position - rest)).sum() / 1e-3
+
+    inputs = {name: values[name].clone().requires_grad_() for name in names}
+    loss(inputs).backward()
+    for name in names:
+        for k in range(values[name].numel()):
+
+            def along(x: float, name: str = name, k: int = k) -> float:
+                moved = values[name].clone()
+                moved.reshape(-1)[k] = x
+                with torch.no_grad():
+                    return float(loss({name: moved}))
+
+            x = float(values[name].reshape(-1)[k])
+            expected, error = richardson(along, x, abs(x) or 1.0)
+            found = float(inputs[name].grad.reshape(-1)[k])
+            # what the issue asks for; the differences agree with themselves to as much
+            assert error < 1e-6 * abs(expected), (name, k)
+            assert found == pytest.approx(expected, rel=1e-6, abs=0.0), (name, k)
+
+
+def test_gradient_error_follows_the_solver_tolerance() -> None:
+    exact, values = hung(0.5, 1000.0)
+    gradients = {}
+    for tolerance in (1e-4, 1e-8, EXACT):
+        rollout = wt.Rollout(exact.scene, 10, tolerance=tolerance)
+        stretch = values["stretch"].clone().requires_grad_()
+        rollout(stretch=stretch).position[-1].pow(2).sum().backward()
+        gradients[tolerance] = stretch.grad
+    for tolerance in (1e-4, 1e-8):
+        error = float((gradients[tolerance] / gradients[EXACT] - 1.0).abs().max())
+        # the tolerance bounds the energy norm of a step's error; what ten steps make of it was seen to be 100 times it
+        assert error < 300.0 * tolerance
+
+
+@pytest.mark.parametrize("at_limit", [False, True], ids=["relaxed", "friction at its limit"])
+def test_state_of_rest_has_finite_and_right_gradients(at_limit: bool) -> None:
+    fabric = cloth(5, 5, pose="flat", friction_damping=0.1)
+    still = wy.Wind(velocity=(0.0, 0.0, 0.0))
+    rollout = wt.Rollout(
+        wy.Scene(fabric, gravity=None, wind=still, pins=fabric.corners()), 3, frames=[3], tolerance=EXACT
+    )
+    fixed = {}
+    if at_limit:
+        # k_f |δ| = μF_n, from the force with which bent yarns press on each other
+        _, contact_force = rollout.simulator.contact()
+        crossing = fabric.topology.is_crossing != 0
+        assert contact_force[crossing].min() > 0.0
+        reach = fabric.friction * contact_force / fabric.friction_stiffness
+        fixed["anchor"] = torch.as_tensor(fabric.euler - reach[:, None])
+    names = ("density", "stretch", "bend", "shear", "friction", "parallel_stiffness", "wind_velocity", "wind_drag")
+    assert gradcheck(*scaled(rollout, names, fixed))
+
+
+# -- how a run is kept ------------------------------------------------------------------------------------------------
+
+
+def gradient_of(rollout: wt.Rollout) -> tuple[torch.Tensor, wt.Frames]:
+    stretch = torch.tensor([5.0e5, 1.7e5], dtype=torch.float64, requires_grad=True)
+    frames = rollout(stretch=stretch, **jittered(rollout.scene.cloth))
+    last = frames.position[-1] / 1e-3
+    (last.pow(2).sum() + (frames.euler[0] / 1e-3).sum()).backward()
+    return stretch.grad, frames
+
+
+@pytest.mark.parametrize("every", [2, 3, 7, 20])
+def test_checkpoints_change_nothing(every: int) -> None:
+    scene = scene_for("plain", 7)
+    expected, frames = gradient_of(wt.Rollout(scene, 7))
+    found, checkpointed = gradient_of(wt.Rollout(scene, 7, checkpoint_every=every))
+    # the same operations in the same order: the same bits
+    assert torch.equal(found, expected)
+    assert all(torch.equal(a, b) for a, b in zip(frames, checkpointed, strict=True))
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_chosen_frames_are_those_of_the_whole_run(every: int) -> None:
+    scene = scene_for("plain", 7)
+    chosen = [0, 2, 3, 6]
+    part = wt.Rollout(scene, 7, frames=chosen, checkpoint_every=every)
+    entire = wt.Rollout(scene, 7)
+    gradients = []
+    for rollout, pick in ((part, slice(None)), (entire, chosen)):
+        inputs = {name: value.requires_grad_() for name, value in jittered(scene.cloth).items()}
+        frames = rollout(**inputs)
+        (frames.position[pick] * 1e3).pow(2).sum().backward()
+        gradients.append(torch.cat([value.grad.reshape(-1) for value in inputs.values()]))
+        assert len(frames.position) == (4 if rollout is part else 8)
+    assert torch.equal(*gradients)
+
+
+def test_run_is_the_simulator_s() -> None:
+    scene = scene_for("forces", 5)
+    frames = wt.Rollout(scene, 70)()
+    trajectory = wy.Simulator(scene).run(70)
+    assert np.array_equal(frames.position.numpy(), trajectory.position)
+    assert np.array_equal(frames.euler.numpy(), trajectory.euler)
+
+
+def test_two_runs_in_one_loss() -> None:
+    rollout = wt.Rollout(scene_for("plain", 3), 3)
+    values = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (900.0, 1100.0)]
+    separate = []
+    for value in values:
+        (gradient,) = torch.autograd.grad((rollout(shear=value).position[-1] * 1e3).pow(2).sum(), value)
+        separate.append(gradient)
+    both = sum((rollout(shear=value).position[-1] * 1e3).pow(2).sum() for value in values)
+    assert torch.equal(torch.stack(torch.autograd.grad(both, values)), torch.stack(separate))
+
+
+def test_a_forward_user_has_no_gradient_arrays() -> None:
+    simulator = wy.Simulator(scene_for("plain", 1))
+    simulator.run(2)
+    assert all(getattr(array, "grad", None) is None for array in simulator.arrays.values())
+
+
+# -- the module -------------------------------------------------------------------------------------------------------
+
+
+def test_fabric_is_bounded_and_composes() -> None:
+    scene = scene_for("plain", 2)
+    fabric = wt.Fabric(scene, 2, learn={"density": (1e-3, 3e-3), "shear": (0.0, 2000.0)}, initial={"shear": 600.0})
+    assert torch.allclose(fabric.value("density"), torch.tensor([2.0e-3, 2.5e-3], dtype=torch.float64), rtol=1e-12)
+    assert fabric.value("shear").item() == pytest.approx(600.0, rel=1e-12)
+
+    wind = torch.nn.Linear(1, 3)  # a network before it, in single precision as torch makes it
+    reader = torch.nn.Linear(3, 1).double()  # and one behind it
+    output = reader(fabric(wind_velocity=wind(torch.ones(1))).position[-1]).sum()
+    output.backward()
+    for parameter in (*fabric.parameters(), *wind.parameters(), *reader.parameters()):
+        assert parameter.grad is not None and bool(torch.isfinite(parameter.grad).all())
+    assert wind.weight.grad.dtype == torch.float32
+
+    optimizer = torch.optim.SGD(fabric.parameters(), lr=1e12)
+    optimizer.step()
+    for name, (low, high) in fabric.ranges.items():
+        assert bool(((fabric.value(name) >= low) & (fabric.value(name) <= high)).all())
+
+    other = wt.Fabric(scene, 2, learn={"density": (1e-3, 3e-3), "shear": (0.0, 2000.0)})
+    other.load_state_dict(fabric.state_dict())
+    assert all(torch.equal(other.value(name), fabric.value(name)) for name in fabric.ranges)
+
+
+def test_gradient_descent_finds_a_parameter() -> None:
+    scene = scene_for("plain", 10)
+    fabric = wt.Fabric(scene, 10, learn={"wind_drag": (0.0, 5.0)}, initial={"wind_drag": 3.0})
+    with torch.no_grad():
+        target = fabric.rollout(wind_drag=torch.tensor(1.0)).position
+    optimizer = torch.optim.LBFGS(fabric.parameters(), line_search_fn="strong_wolfe", max_iter=20)
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        loss = ((fabric().position - target) / 1e-5).pow(2).mean()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    assert fabric.value("wind_drag").item() == pytest.approx(1.0, rel=1e-4)
+
+
+# -- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        ({"spacing": torch.tensor(1e-3)}, "is no input of this scene.*inputs are"),
+        ({"forces": torch.zeros(1, 1, 3)}, "is no input of this scene"),
+        ({"shear": torch.zeros(2)}, r"shear has shape \(2,\), must be \(\)"),
+        ({"stretch": torch.tensor([5e5, float("nan")])}, "stretch is not finite"),
+        ({"stretch": torch.ones(2), "yarn_stretch": torch.ones(9)}, "both given"),
+    ],
+)
+def test_bad_inputs(inputs: dict[str, torch.Tensor], message: str) -> None:
+    with pytest.raises(wy.InputError, match=message):
+        wt.Rollout(scene_for("plain", 1), 1)(**inputs)
+
+
+@pytest.mark.parametrize("frames", [[], [3, 2], [0, 9], [-1]])
+def test_bad_frames(frames: list[int]) -> None:
+    with pytest.raises(wy.InputError, match="frames"):
+        wt.Rollout(scene_for("plain", 1), 5, frames=frames)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"learn": {"spacing": (0.0, 1.0)}}, "learn names 'spacing'"),
+        ({"learn": {"shear": (1.0, 1.0)}}, "must be above"),
+        ({"learn": {"shear": (0.0, 500.0)}}, "strictly between 0 and 500"),
+    ],
+)
+def test_bad_fabric(options: dict, message: str) -> None:
+    with pytest.raises(wy.InputError, match=message):
+        wt.Fabric(scene_for("plain", 1), 1, **options)
+
+
+def test_forward_failure_raises_the_forward_error() -> None:
+    rollout = wt.Rollout(scene_for("plain", 3), 3)
+    state = jittered(rollout.scene.cloth)
+    state["velocity"] = state["velocity"] * 1e200
+    with pytest.raises(wy.SimulationError, match="step 1"):
+        rollout(**state)
+    # and the rollout is still good for another call
+    assert bool(torch.isfinite(rollout().position).all())
+
+
+def test_gradient_that_is_not_finite_names_step_and_term() -> None:
+    rollout = wt.Rollout(scene_for("plain", 3), 3)
+    stretch = torch.tensor([5.0e5, 1.7e5], dtype=torch.float64, requires_grad=True)
+    frames = rollout(stretch=stretch)
+    with pytest.raises(wy.GradientError, match=r"step 2.*not finite") as error:
+        (frames.position[2] * float("inf")).sum().backward()
+    assert error.value.step == 2
