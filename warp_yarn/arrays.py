@@ -152,6 +152,18 @@ class Arrays(dict[str, Any]):
             if self[name] is not None:
                 self[name].zero_()
 
+    def require_grad(self, *names: str) -> None:
+        """Makes room for the gradients of arrays, those that the scene has."""
+        for name in names:
+            if self[name] is not None:
+                self[name].requires_grad = True
+
+    def zero_grad(self, *names: str) -> None:
+        """Sets gradients to 0, of the arrays that the scene has."""
+        for name in names:
+            if self[name] is not None:
+                self[name].grad.zero_()
+
     def launch(self, kernel: wp.Kernel, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel over elements, its arguments found by their names."""
         dim = self.dims[elements] if isinstance(elements, str) else elements

@@ -1,43 +1,38 @@
-"""The simulator: eq. 2, assembled and solved on the device, captured once and replayed."""
+"""The simulator: runs a scene, keeps its frames, and lets one look into a state."""
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 import tqdm
-import warp as wp
 
-from .arrays import STATE_TYPES, Arrays
-from .errors import InputError, SimulationError, choice, number, whole
-from .kernels import Variant, build, step
+from .arrays import STATE_TYPES
+from .errors import InputError, SimulationError, choice, whole
+from .integrators import INTEGRATORS
+from .kernels import step
+from .model import Model
 from .scene import Scene
 from .state import FIELDS, State, Trajectory
+from .system import System, gather
 
-MATRIX = (
-    "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
-)  # fmt: skip
-SUMS = ("force", "euler_force", "momentum", "euler_momentum")
-PRECONDITIONERS = ("incomplete", "jacobi")
-PATHS = ("pin_target", "applied_force")
-"""Inputs that may change from step to step."""
 CHUNK_BYTES = 1 << 24
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
-PRECISIONS = {"double": wp.float64, "single": wp.float32}
 
 
 class Simulator:
-    """Simulates a scene by eq. 2 of the paper: one linear solve a step, first order in the step.
+    """Simulates a scene.
 
     Args:
         scene: the scene.
         step: h, time step [s], above 0.
+        integrator: the method, by name: "linear" is eq. 2 of the paper.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
-        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the matrix' diagonal.
+        preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (see ``kernels/solver.py``).
+        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-8, in
+            single precision 1e-4.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
-
         chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
 
     Attributes:
@@ -51,6 +46,7 @@ class Simulator:
         scene: Scene,
         *,
         step: float = 1e-3,
+        integrator: str = "linear",
         device: Any = "cpu",
         precision: str = "double",
         preconditioner: str = "incomplete",
@@ -58,35 +54,21 @@ class Simulator:
         max_iterations: int | None = None,
         chunk: int | None = None,
     ):
-        if not isinstance(scene, Scene):
-            raise InputError(f"scene = {scene!r}, must be a Scene")
-        self.scene = scene
-        self.step_size = number("step", step, above=0.0)
-        self.precision = choice("precision", precision, PRECISIONS)
-        self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
-        default = {"double": 1e-8, "single": 1e-4}[precision]
-        self.tolerance = default if tolerance is None else number("tolerance", tolerance, above=0.0)
-        degrees = scene.cloth.nodes * (5 if scene.sliding else 3)
-        self.max_iterations = (
-            max(1000, degrees) if max_iterations is None else whole("max_iterations", max_iterations, least=1)
+        method = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
+        self.model = Model(
+            scene,
+            step=step,
+            device=device,
+            precision=precision,
+            preconditioner=preconditioner,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
         )
-        try:
-            self.device = wp.get_device(device)
-        except Exception as error:
-            names = ", ".join(str(d) for d in wp.get_devices())
-            raise InputError(f"device = {device!r}, must be one of {names}") from error
-        variant = Variant(PRECISIONS[precision], scene.sliding)
-        self.kernels = build(variant)
-        self.arrays = Arrays(scene, variant, self.device)
-        h = self.step_size
-        self.arrays["weights"].assign(np.array([[1.0, h, h * h]]))
-        self.arrays["step_size"].assign(np.array([h]))
-        self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
-        self._graph: Any = None
+        self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
+        self.integrator = method(self.model)
         self.steps_done = 0
-        self.chunk = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
-        if chunk is not None:
-            self.chunk = whole("chunk", chunk, least=1)
+        fitting = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
+        self.chunk = fitting if chunk is None else whole("chunk", chunk, least=1)
         self.arrays.add_frames(self.chunk + 1)
         self.state = self._rest()
 
@@ -140,82 +122,7 @@ class Simulator:
                 value = np.asarray(getattr(state, name))
                 array.assign(value if array.dtype == self.arrays.variant.vec3 else value.ravel())
 
-    # -- one step ----------------------------------------------------------------------------------------------------
-
-    def assemble(self, *, matrix: bool = True) -> None:
-        """Launches what fills forces, momentum and matrix from the state: the terms of the scene, in their order."""
-        a, flag = self.arrays, int(matrix)
-        a.zero(*SUMS)
-        if matrix:
-            a.zero(*MATRIX)
-        self._contact()
-        for term in a.terms:
-            a.launch(self.kernels[term.name], term.elements, matrix=flag)
-        a.launch(self.kernels["right_hand_side"], "nodes")
-
-    def _contact(self) -> None:
-        a = self.arrays
-        if a.contact:
-            a.zero("contact_load")
-            a.launch(self.kernels["contact_normal"], "crossings")
-            for term in a.terms:
-                if term.contact_load is not None:
-                    a.launch(self.kernels[f"{term.name}_contact_load"], term.elements)
-
-    def prescribe(self) -> None:
-        """Gives exact pins the velocity that brings them to their place."""
-        if self.held:
-            self.arrays.launch(self.kernels["prescribe"], "pins")
-
-    def solve(self, **replaced: Any) -> None:
-        """Launches the conjugate gradient on the assembled system, with other vectors where they are given."""
-        a = self.arrays
-        a.launch(self.kernels["precondition"], "nodes")
-        if self.preconditioner == "incomplete":
-            a.launch(self.kernels["factorize"], 1)
-        a.launch(
-            self.kernels[f"{self.preconditioner}_conjugate_gradient"],
-            1,
-            tolerance=self.tolerance,
-            most_iterations=self.max_iterations,
-            **replaced,
-        )
-
-    def _step(self) -> None:
-        a = self.arrays
-        self.take_inputs()
-        self.assemble()
-        # The last velocity is the start: a step changes it little.
-        wp.copy(a["solution"], a["velocity"])
-        if self.scene.sliding:
-            wp.copy(a["euler_solution"], a["euler_velocity"])
-        self.prescribe()
-        self.solve()
-        a.launch(self.kernels["advance"], "nodes")
-        if self.scene.sliding:
-            a.launch(self.kernels["check_order"], "segments")
-        if a["anchor"] is not None:
-            self.drag_anchor("euler", "anchor")
-
-    def drag_anchor(self, euler: str, anchor: str) -> None:
-        """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
-        a = self.arrays
-        a.launch(self.kernels["drag_anchor"], "crossings", euler_next=a[euler], anchor_next=a[anchor])
-
-    def take_inputs(self) -> None:
-        """Puts this step's pins and applied forces in place, where they change."""
-        for name in PATHS:
-            if f"{name}_path" in self.arrays:
-                path, values = self.arrays[f"{name}_path"], self.arrays[name]
-                self.arrays.launch(self.kernels["take"], len(values), path=path, values=values)
-
-    def _capture_step(self) -> Any:
-        """One step and its record as a graph: replayed, its twenty launches cost microseconds."""
-        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-            self._step()
-            self.arrays.launch(self.kernels["count"], 1, by=1)
-            self.arrays.launch(self.kernels["record"], "nodes")
-        return capture.graph
+    # -- running -----------------------------------------------------------------------------------------------------
 
     def run_chunk(self, steps: int) -> int:
         """Makes at most ``chunk`` steps, into the frames on the device; the state is frame 0.
@@ -223,21 +130,17 @@ class Simulator:
         Returns:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
-        if self._graph is None:
-            self._graph = self._capture_step()
         self.arrays["counters"].assign(np.array([0, self.steps_done], dtype=np.int32))
-        self.arrays.launch(self.kernels["record"], "nodes")
-        status = self.arrays["status"].numpy() if self.device.is_cpu else np.zeros(1)
+        self.model.launch("record", "nodes")
+        status = self.arrays["status"].numpy() if self.model.device.is_cpu else np.zeros(1)
         for _ in range(steps):
-            wp.capture_launch(self._graph)
+            self.integrator.advance()
             if status[0]:  # on the CPU the array itself; elsewhere looking would wait for every step
                 break
         status = self.arrays["status"].numpy()
         made = int(status[2]) - 1 if status[0] else steps
         self.steps_done += made
         return made
-
-    # -- running -----------------------------------------------------------------------------------------------------
 
     def run(self, steps: int, *, progress: bool = False) -> Trajectory:
         """Makes steps and returns every frame, the present one first.
@@ -301,7 +204,7 @@ class Simulator:
             step.ORDER_LOST: "Δs to the next crossing of the yarn reached 0",
             step.NOT_CONVERGED: (
                 f"the solver stopped after {iterations} iterations at a residual of {residual:.1e}, "
-                f"above its tolerance of {self.tolerance:.1e}"
+                f"above its tolerance of {self.model.tolerance:.1e}"
             ),
         }[code]
         raise SimulationError(
@@ -316,7 +219,9 @@ class Simulator:
     def _blame(self, state: State, node: int) -> str | None:
         """The term with the largest, or a not finite, force on a node."""
         size = {}
-        for name, (force, euler_force) in self.forces(state).items():
+        with np.errstate(all="ignore"):
+            forces = self.forces(state)
+        for name, (force, euler_force) in forces.items():
             total = float(np.abs(force[node]).sum() + np.abs(euler_force[node]).sum())
             size[name] = total if np.isfinite(total) else np.inf
         return max(size, key=lambda name: size[name], default=None)
@@ -332,7 +237,7 @@ class Simulator:
         a, nodes, result = self.arrays, self.scene.cloth.nodes, {}
         crossing = np.repeat(self.scene.cloth.topology.is_crossing != 0, 2)
         with _Visit(self, state):
-            self._contact()
+            self.model.press()
             total = np.zeros(2 * nodes)
             for term in a.terms:
                 if term.name == "mass":
@@ -340,7 +245,7 @@ class Simulator:
                 a.zero("force", "euler_force", "friction_force_out")
                 if term.name == "friction":
                     a["euler_force"].assign(total)
-                a.launch(self.kernels[term.name], term.elements, matrix=0)
+                self.model.launch(term.name, term.elements, matrix=0)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"
                 along = np.zeros(2 * nodes)
                 if a[out] is not None:
@@ -355,7 +260,7 @@ class Simulator:
         if not self.arrays.contact:
             raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
         with _Visit(self, state):
-            self._contact()
+            self.model.press()
             load = self.arrays["contact_load"].numpy().astype(np.float64)
             return self.arrays["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
 
@@ -363,84 +268,20 @@ class Simulator:
         """Energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.arrays, {}
         with _Visit(self, state):
-            self._contact()
+            self.model.press()
             energy = a.zeros(1, a.variant.scalar)
             for term in a.terms:
                 if term.energy is not None:
                     energy.zero_()
-                    a.launch(self.kernels[f"{term.name}_energy"], term.elements, energy=energy)
+                    self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
                     result[term.name] = float(energy.numpy()[0])
         return result
 
     def system(self, state: State | None = None) -> System:
-        """The linear system of the next step, to look into: eq. 2 as it is solved."""
-        a, nodes, stencil = self.arrays, self.scene.cloth.nodes, self.arrays.stencil
+        """The linear system of the next step of eq. 2, to look into."""
         with _Visit(self, state):
-            self.assemble()
-            values = {name: a[name].numpy().copy() for name in (*MATRIX, "rhs", "euler_rhs") if a[name] is not None}
-        x = np.arange(3 * nodes).reshape(nodes, 3)
-        s = 3 * nodes + np.arange(2 * nodes).reshape(nodes, 2)
-        rows, columns, entries = [], [], []
-
-        def add(i: np.ndarray, j: np.ndarray, value: np.ndarray, mirror: bool = True) -> None:
-            pairs = [(i[:, :, None], j[:, None, :], value)]
-            if mirror:
-                pairs.append((j[:, :, None], i[:, None, :], value.swapaxes(1, 2)))
-            for row, column, entry in pairs:
-                row, column, entry = np.broadcast_arrays(row, column, entry)
-                rows.append(row.ravel())
-                columns.append(column.ravel())
-                entries.append(entry.ravel())
-
-        neighbour = self.arrays["neighbour"].numpy().reshape(nodes, stencil)
-        add(x, x, values["diagonal_xx"], mirror=False)
-        node, slot = np.nonzero(neighbour >= 0)
-        other = neighbour[node, slot]
-        add(x[node], x[other], values["upper_xx"].reshape(nodes, stencil, 3, 3)[node, slot])
-        if self.scene.sliding:
-            for d in range(2):
-                add(x, s[:, [d]], values["diagonal_xs"].reshape(nodes, 2, 3)[:, d, :, None])
-                add(s[:, [d]], s[:, [d]], values["diagonal_ss"].reshape(nodes, 2)[:, d, None, None], mirror=False)
-            near = slot < 4
-            node, slot, other = node[near], slot[near], other[near]
-            d = slot % 2
-            mine, its = s[node, d][:, None], s[other, d][:, None]
-            add(x[node], its, values["upper_xs"].reshape(nodes, 4, 3)[node, slot][:, :, None])
-            add(mine, x[other], values["upper_sx"].reshape(nodes, 4, 3)[node, slot][:, None, :])
-            add(mine, its, values["upper_ss"].reshape(nodes, 4)[node, slot][:, None, None])
-        topology = self.scene.cloth.topology
-        free = [np.repeat(a["is_free"].numpy() != 0, 3)]
-        rhs = [values["rhs"].ravel()]
-        if self.scene.sliding:
-            free.append(np.repeat(topology.is_crossing != 0, 2))
-            rhs.append(values["euler_rhs"])
-        return System(
-            np.concatenate(rows),
-            np.concatenate(columns),
-            np.concatenate(entries),
-            np.concatenate(rhs),
-            np.concatenate(free),
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class System:
-    """A symmetric linear system: entries of its matrix, right-hand side, and which unknowns are free to move.
-
-    Unknown 3 i + k is velocity k of node i; behind them, with sliding, unknown 3 nodes + 2 i + d its rate along d.
-    """
-
-    rows: np.ndarray
-    columns: np.ndarray
-    entries: np.ndarray
-    rhs: np.ndarray
-    free: np.ndarray
-
-    def dense(self) -> np.ndarray:
-        """The matrix, as a dense array."""
-        result = np.zeros((len(self.rhs), len(self.rhs)))
-        np.add.at(result, (self.rows, self.columns), self.entries)
-        return result
+            self.model.assemble()
+            return gather(self.model)
 
 
 class _Visit:

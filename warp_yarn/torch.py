@@ -79,8 +79,8 @@ class Rollout:
             raise InputError(f"frames = {frames}, must increase from 0 at least to {steps} at most")
         chunk = None if checkpoint_every == 1 else checkpoint_every
         self.simulator = Simulator(scene, chunk=chunk, **options)
-        self.dtype = {"double": torch.float64, "single": torch.float32}[self.simulator.precision]
-        self.device = wp.device_to_torch(self.simulator.device)
+        self.dtype = {"double": torch.float64, "single": torch.float32}[self.simulator.model.precision]
+        self.device = wp.device_to_torch(self.simulator.model.device)
         self.defaults = self._defaults()
         self._adjoints: dict[tuple[str, ...], Adjoint] = {}
 

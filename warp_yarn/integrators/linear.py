@@ -1,0 +1,125 @@
+"""Eq. 2 of the paper, linearly implicit Euler, and its adjoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from ..model import MATRIX, SUMS, Model
+
+BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
+"""Arrays within a step whose adjoints start at 0."""
+
+
+class LinearlyImplicitEuler:
+    """(M + h² H + h D) q̇⁺ = h F + (M + h D) q̇,   q⁺ = q + h q̇⁺: one linear solve a step.
+
+    Order 1. Damps stiff modes as implicit Euler does, H being the positive semi-definite part of the stiffness; what is
+    not in H and D (wind by position, inertia, what friction owes to the contact force) is explicit.
+    """
+
+    name = "linear"
+    order = 1
+
+    def __init__(self, model: Model):
+        self.model = model
+        self._forward: Any = None
+        self._backward: Any = None
+
+    def advance(self) -> None:
+        """Makes a step, and records it. Captured at the first call: replayed, its twenty launches cost microseconds."""
+        if self._forward is None:
+            with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
+                self._step()
+            self._forward = capture.graph
+        wp.capture_launch(self._forward)
+
+    def _step(self) -> None:
+        model, a = self.model, self.model.arrays
+        model.take_inputs()
+        model.assemble()
+        # The last velocity is the start: a step changes it little.
+        wp.copy(a["solution"], a["velocity"])
+        if model.scene.sliding:
+            wp.copy(a["euler_solution"], a["euler_velocity"])
+        model.prescribe()
+        model.solve()
+        model.launch("advance", "nodes")
+        if model.scene.sliding:
+            model.launch("check_order", "segments")
+        model.drag_anchor("euler", "anchor")
+        model.launch("count", 1, by=1)
+        model.launch("record", "nodes")
+
+    # -- adjoint -----------------------------------------------------------------------------------------------------
+
+    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[], None]) -> None:
+        """Makes room for the adjoints within a step, and records what the tape reverses.
+
+        Args:
+            before, after: launch what a run has to do with adjoints before and after every step.
+        """
+        model, a = self.model, self.model.arrays
+        if "seed" not in a:
+            vec3, scalar, n = a.variant.vec3, a.variant.scalar, a["nodes"]
+            a["seed"] = a.zeros(n, vec3)
+            sliding = {"euler_seed": 2 * n, "euler_next": 2 * n}
+            a |= {name: a.zeros(count, scalar) if model.scene.sliding else None for name, count in sliding.items()}
+            a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, scalar)
+        a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
+        if model.scene.sliding:
+            # s⁺ is the end of the step for friction's anchor too: one running adjoint
+            a["euler_next"].grad = a["euler"].grad
+        self.tape, self.anchor_tape = wp.Tape(), wp.Tape()
+        with self.tape:
+            model.assemble()
+            model.prescribe()
+        with self.anchor_tape:
+            model.drag_anchor("euler_next", "anchor_next")
+        self._around = before, after
+        self._backward = None
+
+    def retreat(self) -> None:
+        """Goes back over the step that ends at the present frame.
+
+        Before, the gradients of the state's arrays hold the adjoint of the step's end; after, that of its beginning,
+        and those of parameters have gained the step's part.
+        """
+        if self._backward is None:
+            with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
+                before, after = self._around
+                before()
+                self._begin()
+                self._solve()
+                self.tape.backward()
+                after()
+            self._backward = capture.graph
+        wp.capture_launch(self._backward)
+
+    def _begin(self) -> None:
+        """Recalls and assembles the step again, and takes friction's anchors back."""
+        model, a = self.model, self.model.arrays
+        model.launch("count", 1, by=-1)
+        model.launch("recall", "nodes")
+        model.take_inputs()
+        model.assemble()
+        a.zero_grad(*BETWEEN)
+        if a["anchor"] is not None:
+            wp.copy(a["anchor_next"].grad, a["anchor"].grad)
+            a["anchor"].grad.zero_()
+            self.anchor_tape.backward()
+
+    def _solve(self) -> None:
+        """λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
+        model, a = self.model, self.model.arrays
+        model.launch("adjoint_right_hand_side", "nodes")
+        multiplier = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
+        model.solve(rhs=a["seed"], euler_rhs=a["euler_seed"], **multiplier)
+        if model.held:
+            a.zero("q_x", "q_s")
+            a["solution"].grad.zero_()
+            model.launch("apply_matrix", 1, p_x=a["rhs"].grad, p_s=a.find("euler_rhs_grad"))
+            model.launch("held_adjoint", "pins")
+        model.launch("matrix_adjoint", "nodes")
