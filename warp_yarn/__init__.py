@@ -1,10 +1,14 @@
 """Differentiable simulation of woven fabric, yarn by yarn."""
 
+from . import paper
 from .cloth import Cloth, Yarn
 from .errors import GradientError, InputError, SimulationError, WarpYarnError
+from .published import Published, read_published
+from .render import write_mp4, write_png
 from .scene import Scene, Wind
 from .simulator import Simulator
 from .state import State, Trajectory
+from .usd import write_usd
 from .weave import WEAVES, Weave
 
 __all__ = [
@@ -12,6 +16,7 @@ __all__ = [
     "Cloth",
     "GradientError",
     "InputError",
+    "Published",
     "Scene",
     "SimulationError",
     "Simulator",
@@ -21,4 +26,9 @@ __all__ = [
     "Weave",
     "Wind",
     "Yarn",
+    "paper",
+    "read_published",
+    "write_mp4",
+    "write_png",
+    "write_usd",
 ]

@@ -1,0 +1,160 @@
+"""scenes/hang.py at 5 × 5, in this process."""
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+from scripts import load
+
+import warp_yarn as wy
+from warp_yarn.state import FIELDS
+
+hang = load("scenes/hang.py")
+
+
+def exit_code(arguments):
+    """What ``python scenes/hang.py`` would return."""
+    try:
+        return hang.command(hang.main, arguments)
+    except SystemExit as exit:  # argparse
+        return exit.code
+
+
+def samples(path):
+    """Number of frames of each yarn material in a USD file."""
+    stage = Usd.Stage.Open(str(path))
+    shapes = [UsdGeom.PointBased(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)]
+    return [shape.GetPointsAttr().GetNumTimeSamples() for shape in shapes]
+
+
+@pytest.fixture
+def usd(tmp_path):
+    return tmp_path / "new folder" / "hang.usdc"
+
+
+def test_the_cloth_hangs_by_its_corners_and_blows_along_the_wind(usd, capsys):
+    trajectory = hang.main(["--size", "5", "--steps", "20", "--output", str(usd)])
+    cloth = trajectory.cloth
+    moved = trajectory.position - cloth.position
+    assert np.abs(moved[:, cloth.corners("top")]).max() < 1e-5
+    lower = moved[:, -cloth.weave.columns :, 1].mean(axis=1)
+    assert (np.diff(lower) > 0.0).all()
+    # Pushed freely by the pressure ρ_w v² on the area L² of a node, which weighs about 2 L · 2.25e-3 kg/m, it would be
+    # at ½ a t² = 2.2 mm; it is held, and the wind that it feels slackens.
+    assert 1e-3 < lower[-1] < 2.2e-3
+    assert samples(usd) == [21, 21]
+    told = capsys.readouterr().out
+    assert "5 × 5 yarns, plain: 21 frames" in told
+    assert str(usd) in told
+
+
+def test_wind_weave_yarns_and_size_are_the_ones_asked_for(usd):
+    arguments = ["--rows", "5", "--columns", "7", "--weave", "twill", "--yarns", "3", "1", "--wind", "0", "-5", "0"]
+    trajectory = hang.main([*arguments, "--steps", "2", "--step", "5e-4", "--output", str(usd), "--tubes"])
+    cloth = trajectory.cloth
+    assert (cloth.weave.name, cloth.weave.rows, cloth.weave.columns) == ("twill", 5, 7)
+    assert cloth.yarns == (wy.paper.YARNS[3], wy.paper.YARNS[1])
+    assert cloth.shear == 700.0
+    assert trajectory.step == 5e-4
+    assert trajectory.position[-1, :, 1].mean() < 0.0
+    assert UsdGeom.Mesh(Usd.Stage.Open(str(usd)).GetPrimAtPath("/cloth/yarn_0"))
+
+
+def test_locked_yarns_do_not_slide(usd):
+    trajectory = hang.main(["--size", "5", "--steps", "5", "--output", str(usd), "--locked"])
+    np.testing.assert_array_equal(trajectory.euler, np.broadcast_to(trajectory.cloth.euler, trajectory.euler.shape))
+    assert np.abs(trajectory.position[-1] - trajectory.position[0]).max() > 1e-5
+
+
+def test_a_resumed_run_is_the_uninterrupted_one(usd, tmp_path):
+    whole = hang.main(["--size", "5", "--steps", "12", "--output", str(usd)])
+    record = str(tmp_path / "first.npz")
+    hang.main(["--size", "5", "--steps", "6", "--output", str(usd), "--record", record])
+    both = hang.main(["--resume", record, "--steps", "6", "--output", str(usd)])
+    assert samples(usd) == [13, 13]
+    for name in FIELDS:
+        expected = getattr(whole, name)
+        # The same operations on the same numbers.
+        np.testing.assert_allclose(getattr(both, name), expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+
+
+def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
+    record = str(tmp_path / "first.npz")
+    hang.main(["--size", "5", "--steps", "1", "--output", str(usd), "--record", record])
+    for option in (["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"]):
+        assert exit_code(["--resume", record, *option]) == 2
+        assert option[0] in capsys.readouterr().err
+
+
+def test_a_failing_simulation_leaves_the_frames_before_it(usd, capsys):
+    arguments = ["--size", "5", "--wind", "0", "500", "0", "--steps", "10", "--output", str(usd)]
+    with pytest.raises(wy.SimulationError) as failure:
+        hang.main(arguments)
+    assert 1 < failure.value.step < 10
+    assert len(failure.value.trajectory) == failure.value.step
+    assert samples(usd) == [failure.value.step] * 2
+    usd.unlink()
+    capsys.readouterr()
+    assert exit_code(arguments) == 1
+    assert samples(usd) == [failure.value.step] * 2
+    told = capsys.readouterr()
+    assert f"The simulation failed in step {failure.value.step}" in told.err
+    assert f"{failure.value.step} frames" in told.out
+
+
+def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
+    run, calls = wy.Simulator.run_chunk, []
+
+    def interrupted(simulator, steps):
+        calls.append(steps)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return run(simulator, steps)
+
+    monkeypatch.setattr(wy.Simulator, "run_chunk", interrupted)
+    assert exit_code(["--size", "5", "--steps", "10", "--output", str(usd)]) == 130
+    assert samples(usd) == [4, 4]
+    assert "Ctrl-C" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--size", "2"], "rows = 2"),
+        (["--columns", "-4"], "columns = -4"),
+        (["--size", "five"], "--size"),
+        (["--weave", "knit"], "--weave"),
+        (["--yarns", "1", "1"], "yarns = 1 1"),
+        (["--yarns", "1", "9"], "yarns = 1 9"),
+        (["--wind", "0", "nan", "0"], "wind velocity[1] is nan"),
+        (["--wind", "5"], "--wind"),
+        (["--steps", "0"], "steps = 0"),
+        (["--step", "0"], "step = 0"),
+        (["--step", "inf"], "step = inf"),
+        (["--slowdown", "-1"], "--slowdown"),
+        (["--output", "hang.obj"], "hang.obj"),
+        (["--png", "hang.usdc"], "hang.usdc"),
+        (["--resume", "nowhere.npz"], "nowhere.npz: there is no such file"),
+        (["--colour", "red"], "--colour"),
+    ],
+)
+def test_wrong_arguments_end_with_code_2_and_a_message(arguments, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert exit_code(arguments) == 2
+    told = capsys.readouterr()
+    assert named in told.err
+    assert "Traceback" not in told.err
+    assert not list(tmp_path.rglob("*.usdc"))
+
+
+def test_a_folder_that_cannot_be_made_ends_with_code_2(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert exit_code(["--output", str(tmp_path / "file" / "hang.usdc")]) == 2
+    assert "file" in capsys.readouterr().err
+
+
+def test_pictures_on_request(usd, tmp_path):
+    png, mp4 = tmp_path / "hang.png", tmp_path / "pictures" / "hang.mp4"
+    arguments = ["--size", "3", "--steps", "4", "--slowdown", "20", "--png", str(png), "--mp4", str(mp4)]
+    hang.main([*arguments, "--output", str(usd)])
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert b"ftyp" in mp4.read_bytes()[:16]
