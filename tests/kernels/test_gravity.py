@@ -1,0 +1,17 @@
+"""Gravity on a yarn segment."""
+
+import numpy as np
+from cases import GRAVITY, Case
+from checks import ROUNDING, EnergyChecks, error
+
+
+class TestGravity(EnergyChecks):
+    term = "gravity"
+
+    def test_weight(self, case: Case) -> None:
+        """All of it: the yarns' density times length times g."""
+        o = self.oracle(case)
+        length = np.array([o.columns - 1, o.rows - 1]) * case.cloth.spacing
+        mass = length @ [sum(yarn.density for yarn in yarns) for yarns in (o.warp, o.weft)]
+        force, _ = self.simulator(case).forces(case.state)["gravity"]
+        assert error(force.sum(axis=0), mass * np.array(GRAVITY)) < ROUNDING

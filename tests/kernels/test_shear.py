@@ -1,0 +1,158 @@
+"""Shear of warp against weft, and its lock."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+from cases import BENT, YARNS, Case, cases
+from checks import DIFFERENCES, InternalChecks, TermChecks, difference, error, force_of
+from reference import RIGHT, Elements, Tensor, angle, lock, unit
+from torch.func import grad, vmap
+
+import warp_yarn as wy
+
+
+def corner(q: Tensor) -> Tensor:
+    """φ of q = (x_p, x_c, x_r)."""
+    return angle(unit(q[0:3] - q[3:6]), unit(q[6:9] - q[3:6]))
+
+
+def gauss_newton(elements: Elements, q: Tensor, spacing: float, radius: float) -> Tensor:
+    """(V'/(φ − π/2)) ∇φ ∇φᵀ of every corner, the factor at least 0; at the right angle it is V''."""
+
+    def energy(phi: Tensor, k: Tensor, jams: Tensor) -> Tensor:
+        return 0.5 * k * torch.where(jams, lock(phi, spacing, radius), 1.0) * (phi - RIGHT) ** 2
+
+    local = q[elements.unknowns]
+    phi = vmap(corner)(local)
+    strain = phi - RIGHT
+    at_rest = strain.abs() < 1e-9
+    slope = vmap(grad(energy))(phi, *elements.parameters) / torch.where(at_rest, 1.0, strain)
+    factor = torch.where(at_rest, vmap(grad(grad(energy)))(phi, *elements.parameters), slope).clamp(min=0.0)
+    g = vmap(grad(corner))(local)
+    return elements.matrix(factor[:, None, None] * g[:, :, None] * g[:, None, :], len(q))
+
+
+class TestShear(InternalChecks):
+    """Without contact: F_n = 0."""
+
+    term = "shear"
+
+    def expected_matrix(self, case: Case) -> Tensor:
+        elements = self.oracle(case).elements("shear", case.q)
+        return gauss_newton(elements, case.q, case.cloth.spacing, case.cloth.radius)
+
+    def test_some_corners_jam_and_some_do_not(self, case: Case) -> None:
+        """Or the cases above would test little."""
+        jams = self.oracle(case).elements("shear", case.q).parameters[1]
+        assert 0 < int(jams.sum()) < len(jams)
+
+
+class TestPressedShear(TermChecks):
+    """With the contact force of stretch and bending, which the matrix takes as constant and the Jacobian does not."""
+
+    term = "shear"
+    terms = ("stretch", "bending", "shear")
+    cases = cases(states=BENT)
+    step = 1e-9
+    """F_n has a kink at 0, which some crossing is always near."""
+    tolerance_of_differences = 1e-8
+    """1e-16/1e-6 for rounding, times the stiffness of stretch over that of shear, some 100."""
+    expected_matrix = TestShear.expected_matrix
+
+    def test_force_is_minus_the_gradient_of_the_energy(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+        """F_n is held at its value."""
+        sim = self.simulator(case)
+        force = force_of(sim, "shear", case.state)
+        monkeypatch.setattr(sim.arrays, "contact", False)
+        for direction in case.directions(3, "x"):
+            slope = difference(case, direction, 1e-7, lambda state: np.array(sim.energy(state)["shear"]))
+            moved = direction[: len(force)]
+            assert abs(slope + force @ moved) < DIFFERENCES * (np.abs(force) @ np.abs(moved))
+
+
+@pytest.mark.parametrize("case", cases(states=("rest", "stretched")), ids=str)
+def test_matrix_is_exact_at_the_right_angle(case: Case) -> None:
+    """Where the corners do not jam."""
+    elements = case.oracle("shear").elements("shear", case.q)
+    free = elements.of((~elements.parameters[1]).tolist())
+    expected = free.matrix(free.hessians(case.q), len(case.q))
+    actual = gauss_newton(free, case.q, case.cloth.spacing, case.cloth.radius)
+    assert error(actual, expected) < 1e-12
+
+
+# -- the lock --------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def cross_weave(radius: float) -> wy.Simulator:
+    """3 × 3 nodes whose only crossing is flipped against all its neighbours: four corners that can jam."""
+    weave = wy.Weave([[0, 0, 0], [0, 1, 0], [0, 0, 0]])
+    cloth = wy.Cloth(weave, yarns=YARNS[:1], radius=radius, pose="flat")
+    return wy.Simulator(wy.Scene(cloth, terms=["shear"]))
+
+
+def at_angle(sim: wy.Simulator, phi: float) -> wy.State:
+    """Both warp neighbours at one place and both weft neighbours at another, so that all four corners are phi."""
+    x = sim.state.position
+    length = sim.scene.cloth.spacing
+    x[4] = 0.0
+    x[[3, 5]] = [length, 0.0, 0.0]
+    x[[1, 7]] = [length * math.cos(phi), length * math.sin(phi), 0.0]
+    state = sim.state
+    state.position = x
+    return state
+
+
+def stiffening(radius: float, phi: float) -> float:
+    """k_s of eq. 5 over its unlocked value, from the kernel's energy."""
+    sim = cross_weave(radius)
+    c = sim.scene.cloth
+    unlocked = 4 * 0.5 * c.shear * math.pi * radius**2 * c.spacing * (phi - RIGHT) ** 2
+    return sim.energy(at_angle(sim, phi))["shear"] / unlocked
+
+
+ANGLES = (1e-6, 0.1, 0.5, 1.0, 1.04, 1.06, 1.2, 1.5, 1.6, 2.0, 2.5, 3.0, 3.1)
+
+
+@pytest.mark.parametrize("phi", ANGLES)
+@pytest.mark.parametrize("radius", [5e-4, 2e-4, 5e-5])
+def test_lock(radius: float, phi: float) -> None:
+    """Eq. 5."""
+    expected = float(lock(torch.tensor(phi, dtype=torch.float64), 1e-3, radius))
+    # (φ − π/2)² keeps 1e-14 where the angle is nearest to the right one
+    assert stiffening(radius, phi) == pytest.approx(expected, rel=1e-13)
+
+
+@pytest.mark.parametrize("radius", [5e-4, 2e-4, 5e-5])
+def test_limits_of_the_lock(radius: float) -> None:
+    """γ³ = (√2 L/R)³ where the corner is shut; 1 where it is far open, and γ³ growing all the way in between."""
+    # The transition leaves 1 − tanh(π φ_l/(2σ²)) of the other value: at the least radius much, so near 0 is its lock.
+    shut = 2.0 * math.asin(radius / 1e-3)
+    rest = 1.0 - math.tanh(RIGHT * shut / 0.36)
+    assert stiffening(radius, 1e-4) == pytest.approx((math.sqrt(2.0) * 1e-3 / radius) ** 3, rel=rest + 1e-3)
+    rest = 1.0 - math.tanh(RIGHT * (RIGHT - shut) / 0.36)
+    assert stiffening(radius, RIGHT - 1e-3) == pytest.approx(1.0, abs=rest + 1e-6)
+    closing = [stiffening(radius, phi) for phi in np.linspace(shut, 1e-4, 30)]
+    assert np.all(np.diff(closing) > 0.0)
+
+
+@pytest.mark.parametrize("radius", [5e-4, 2e-4, 5e-5])
+def test_a_corner_that_can_jam_pushes_back_at_every_angle(radius: float) -> None:
+    """Towards the right angle, from a shut corner to a flat one: what γ ≥ 0 is for."""
+    sim = cross_weave(radius)
+    for phi in np.linspace(1e-3, math.pi - 1e-3, 60):
+        force, _ = sim.forces(at_angle(sim, phi))["shear"]
+        opening = np.array([-math.sin(phi), math.cos(phi), 0.0])
+        assert force[1] @ opening * (phi - RIGHT) < 0.0
+
+
+@pytest.mark.parametrize("phi", [0.0, math.pi])
+def test_flat_corner_is_finite(phi: float) -> None:
+    sim = cross_weave(5e-4)
+    state = at_angle(sim, phi)
+    force, _ = sim.forces(state)["shear"]
+    assert np.isfinite(force).all()
+    assert np.isfinite(sim.system(state).dense()).all()

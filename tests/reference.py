@@ -1,0 +1,378 @@
+"""The physics a second time, in torch float64, from the formulas alone: what the kernels are held to.
+
+Written from ``physics.md`` row by row and column by column, not from the kernels nor from ``warp_yarn.topology``.
+Energies are functions of one element; forces, Jacobians and Hessians come of them by automatic differentiation.
+
+Unknowns stand in one vector, as in ``Simulator.system``: q = (x of every node, then u, v of every node), and v = q̇.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+
+import torch
+from torch.func import grad, hessian, jvp, vmap
+
+import warp_yarn as wy
+
+RIGHT = 0.5 * math.pi
+TERMS = (
+    "inertia", "mass_rate", "stretch", "bending", "gravity", "parallel", "shear", "wind", "pins", "applied", "friction",
+)  # fmt: skip
+
+Tensor = torch.Tensor
+
+
+def tensor(values: object) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float64)
+
+
+def draft(weave: str, rows: int, columns: int) -> list[list[bool]]:
+    """Flipped crossings of a weave of the paper, [row][column]."""
+
+    def flipped(i: int, j: int) -> bool:
+        if i in (0, columns - 1) or j in (0, rows - 1):
+            return False
+        if weave == "plain":
+            return (i + j) % 2 == 1
+        if weave == "twill":
+            return (i + j % 4) % 4 < 2
+        r = (j - 1) % 4
+        offset = 3 * (r // 2) + 2 * (r % 2)
+        return (i - 1 + offset) % 4 == 0
+
+    return [[flipped(i, j) for i in range(columns)] for j in range(rows)]
+
+
+# -- energies of one element -----------------------------------------------------------------------------------------
+
+
+def unit(d: Tensor) -> Tensor:
+    return d / torch.linalg.vector_norm(d)
+
+
+def stretch(q: Tensor, k: Tensor) -> Tensor:
+    """q = (x_a, x_b, s_a, s_b)."""
+    rest = q[7] - q[6]
+    return 0.5 * k * rest * (torch.linalg.vector_norm((q[3:6] - q[0:3]) / rest) - 1.0) ** 2
+
+
+def kinetic(q: Tensor, v: Tensor, density: Tensor) -> Tensor:
+    rest = q[7] - q[6]
+    w = (q[3:6] - q[0:3]) / rest
+    a = v[0:3] - w * v[6]
+    b = v[3:6] - w * v[7]
+    return density * rest / 6.0 * (a @ a + a @ b + b @ b)
+
+
+def gravity(q: Tensor, density: Tensor, g: Tensor) -> Tensor:
+    return -density * (q[7] - q[6]) * (g @ (q[0:3] + q[3:6])) / 2.0
+
+
+def parallel(q: Tensor, k: Tensor, distance: Tensor) -> Tensor:
+    """q = (s_a, s_b)."""
+    return 0.5 * k * torch.relu(distance - (q[1] - q[0])) ** 2
+
+
+def pin(q: Tensor, k: Tensor, target: Tensor) -> Tensor:
+    return 0.5 * k * (q - target) @ (q - target)
+
+
+def angle(t1: Tensor, t2: Tensor) -> Tensor:
+    """Between unit vectors, to full precision (W. Kahan)."""
+    difference, total = t1 - t2, t1 + t2
+    return 2.0 * torch.atan2(torch.sqrt(difference @ difference), torch.sqrt(total @ total))
+
+
+def angle_squared(t1: Tensor, t2: Tensor) -> Tensor:
+    """Smooth where the vectors are the same: (2 arcsin √y)² = 2 Σ (4y)ⁿ / (n² C(2n, n)) of y = |t1 − t2|²/4."""
+    y = (t1 - t2) @ (t1 - t2) / 4.0
+    series = tensor(0.0)
+    for n in range(6, 0, -1):
+        series = 4.0 * y * (2.0 / (n**2 * math.comb(2 * n, n)) + series)
+    # Both branches are differentiated, so the closed form is given a pair at a right angle where it is not wanted.
+    near = y < 1e-3
+    apart = angle(torch.where(near, tensor([1.0, 0, 0]), t1), torch.where(near, tensor([0, 1.0, 0]), t2))
+    return torch.where(near, series, apart**2)
+
+
+def bending(q: Tensor, k: Tensor) -> Tensor:
+    """q = (x_a, x_c, x_b, s_a, s_b)."""
+    t1, t2 = unit(q[6:9] - q[3:6]), unit(q[0:3] - q[3:6])
+    return k * angle_squared(t1, -t2) / (q[10] - q[9])
+
+
+def lock(phi: Tensor, spacing: float, radius: float) -> Tensor:
+    """Eq. 5, with c = 3 and σ = 0.6, and γ = 0 beyond the right angle."""
+    threshold = 2.0 * math.asin(radius / spacing)
+    gamma = torch.relu((math.sqrt(2.0) * spacing - 2.0 * spacing * torch.sin(phi / 2.0)) / radius)
+    denominator = (phi * (phi - threshold) * (phi - RIGHT)) ** 2 + RIGHT**4 * 0.6**2
+    return 0.5 * ((1.0 + gamma**3) + (1.0 - gamma**3) * torch.tanh(RIGHT**5 * (phi - threshold) / denominator))
+
+
+def shear(q: Tensor, k: Tensor, jams: Tensor, spacing: float, radius: float) -> Tensor:
+    """q = (x_p, x_c, x_r); k = S π R² (1 + F_n) L."""
+    phi = angle(unit(q[0:3] - q[3:6]), unit(q[6:9] - q[3:6]))
+    factor = torch.where(jams, lock(phi, spacing, radius), tensor(1.0))
+    return 0.5 * k * factor * (phi - RIGHT) ** 2
+
+
+def wind(q: Tensor, v: Tensor, velocity: Tensor, density: float, drag: float) -> Tensor:
+    """Force on each of a triangle's three nodes; q and v = (x, y, z of each)."""
+    i, j, k = q[0:3], q[3:6], q[6:9]
+    cross = torch.linalg.cross(j - i, k - i)
+    area, n = torch.linalg.vector_norm(cross) / 2.0, unit(cross)
+    relative = velocity - (v[0:3] + v[3:6] + v[6:9]) / 3.0
+    along = n @ relative
+    force = density * area * torch.abs(along) * along * n + drag * area * (relative - along * n)
+    return (force / 3.0).repeat(3)
+
+
+# -- a whole cloth ---------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Elements:
+    """Elements of one kind: the unknowns of each [elements, m], its energy, and the parameters of each."""
+
+    unknowns: Tensor
+    local: Callable[..., Tensor]
+    parameters: tuple[Tensor, ...]
+
+    def energy(self, q: Tensor) -> Tensor:
+        return vmap(self.local)(q[self.unknowns], *self.parameters).sum()
+
+    def force(self, q: Tensor) -> Tensor:
+        return -grad(self.energy)(q)
+
+    def hessians(self, q: Tensor) -> Tensor:
+        """Exact, of every element by itself."""
+        return vmap(hessian(self.local))(q[self.unknowns], *self.parameters)
+
+    def matrix(self, blocks: Tensor, size: int) -> Tensor:
+        """The sum of the elements' blocks [elements, m, m] in a dense matrix."""
+        result = torch.zeros(size, size, dtype=torch.float64)
+        rows, columns = self.unknowns[:, :, None].expand_as(blocks), self.unknowns[:, None, :].expand_as(blocks)
+        return result.index_put((rows, columns), blocks, accumulate=True)
+
+    def of(self, which: list[bool]) -> Elements:
+        keep = torch.tensor(which)
+        return Elements(self.unknowns[keep], self.local, tuple(p[keep] for p in self.parameters))
+
+
+def clamped(blocks: Tensor) -> Tensor:
+    """Symmetric matrices with their negative eigenvalues set to 0."""
+    values, vectors = torch.linalg.eigh(blocks)
+    return vectors @ torch.diag_embed(values.clamp(min=0.0)) @ vectors.mT
+
+
+class Oracle:
+    """Every term of a scene."""
+
+    def __init__(self, scene: wy.Scene):
+        cloth = scene.cloth
+        self.scene, self.cloth = scene, cloth
+        self.rows, self.columns = cloth.weave.rows, cloth.weave.columns
+        self.nodes = self.rows * self.columns
+        self.size = 5 * self.nodes
+        named = cloth.weave.name in wy.WEAVES
+        self.flipped = draft(cloth.weave.name, self.rows, self.columns) if named else cloth.weave.flipped.tolist()
+        # Yarns alternate, in both directions.
+        self.warp = [cloth.yarns[j % len(cloth.yarns)] for j in range(self.rows)]
+        self.weft = [cloth.yarns[i % len(cloth.yarns)] for i in range(self.columns)]
+        self.area = math.pi * cloth.radius**2
+        self.slides = torch.zeros(self.rows, self.columns, 2, dtype=torch.float64)
+        if scene.sliding:
+            self.slides[1:-1, 1:-1] = 1.0
+        self.slides = self.slides.ravel()
+        self._build()
+
+    # -- where things are
+
+    def node(self, j: int, i: int) -> int:
+        return i + j * self.columns
+
+    def unknowns(self, *nodes: int) -> list[int]:
+        """Of the positions of nodes."""
+        return [3 * node + k for node in nodes for k in range(3)]
+
+    def slide(self, node: int, direction: int) -> int:
+        return 3 * self.nodes + 2 * node + direction
+
+    def crossings(self) -> list[tuple[int, int]]:
+        return [(j, i) for j in range(1, self.rows - 1) for i in range(1, self.columns - 1)]
+
+    def chains(self, length: int) -> list[tuple[tuple[tuple[int, int], ...], int, wy.Yarn]]:
+        """Consecutive crossings (j, i) of one yarn, its direction (0 warp, 1 weft) and its material."""
+        warp = [
+            (tuple((j, i + k) for k in range(length)), 0, self.warp[j])
+            for j in range(self.rows)
+            for i in range(self.columns - length + 1)
+        ]
+        weft = [
+            (tuple((j + k, i) for k in range(length)), 1, self.weft[i])
+            for i in range(self.columns)
+            for j in range(self.rows - length + 1)
+        ]
+        return warp + weft
+
+    def corners(self) -> list[tuple[tuple[int, int], tuple[int, int], tuple[int, int]]]:
+        """(j, i) of a warp neighbour, the crossing and a weft neighbour."""
+        return [((j, i + a), (j, i), (j + b, i)) for j, i in self.crossings() for a in (-1, 1) for b in (-1, 1)]
+
+    def triangles(self) -> list[tuple[int, int, int]]:
+        """Two to a cell; the diagonal runs to the lower right in even cells."""
+        result = []
+        for j in range(self.rows - 1):
+            for i in range(self.columns - 1):
+                a, b = self.node(j, i), self.node(j, i + 1)
+                c, d = self.node(j + 1, i), self.node(j + 1, i + 1)
+                result += [(a, b, d), (a, d, c)] if (i + j) % 2 == 0 else [(a, b, c), (b, d, c)]
+        return result
+
+    # -- energies
+
+    def _segments(self, local: Callable[..., Tensor], *parameters: list) -> Elements:
+        unknowns = []
+        for (a, b), direction, _yarn in self.chains(2):
+            a, b = self.node(*a), self.node(*b)
+            unknowns.append([*self.unknowns(a, b), self.slide(a, direction), self.slide(b, direction)])
+        return Elements(torch.tensor(unknowns), local, tuple(tensor(p) for p in parameters))
+
+    def _build(self) -> None:
+        """All elements at once: a tensor that is first made inside a transform of torch.func cannot be kept."""
+        scene, cloth = self.scene, self.cloth
+        yarns = [yarn for *_, yarn in self.chains(2)]
+        self.stretch = self._segments(stretch, [yarn.stretch * self.area for yarn in yarns])
+        self.inertial = self._segments(kinetic, [yarn.density for yarn in yarns])
+        self.gravity = self._segments(gravity, [yarn.density for yarn in yarns], [scene.gravity.tolist()] * len(yarns))
+
+        unknowns, distance = [], []
+        for (a, b), direction, _yarn in self.chains(2):
+            unknowns.append([self.slide(self.node(*a), direction), self.slide(self.node(*b), direction)])
+            against = self.flipped[a[0]][a[1]] != self.flipped[b[0]][b[1]]
+            distance.append((4.0 if against else 2.0) * cloth.radius)
+        k = cloth.parallel_stiffness * cloth.spacing
+        self.parallel = Elements(torch.tensor(unknowns), parallel, (tensor([k] * len(unknowns)), tensor(distance)))
+
+        unknowns, k = [], []
+        for (a, c, b), direction, yarn in self.chains(3):
+            a, c, b = self.node(*a), self.node(*c), self.node(*b)
+            unknowns.append([*self.unknowns(a, c, b), self.slide(a, direction), self.slide(b, direction)])
+            k.append(yarn.bend * self.area)
+        self.bending = Elements(torch.tensor(unknowns), bending, (tensor(k),))
+
+        nodes = [int(node) for node in scene.pins]
+        k = tensor([scene.pin_stiffness] * len(nodes))
+        self.pins = Elements(
+            torch.tensor([self.unknowns(node) for node in nodes]), pin, (k, tensor(cloth.position[nodes]))
+        )
+
+    def shear(self, contact_force: Tensor) -> Elements:
+        """F_n of every node is held."""
+        unknowns, jams, crossing = [], [], []
+        for corner in self.corners():
+            p, c, r = (self.flipped[j][i] for j, i in corner)
+            nodes = [self.node(*where) for where in corner]
+            unknowns.append(self.unknowns(*nodes))
+            jams.append(c != p and c != r)
+            crossing.append(nodes[1])
+        k = self.cloth.shear * self.area * self.cloth.spacing * (1.0 + contact_force[crossing])
+        local = functools.partial(shear, spacing=self.cloth.spacing, radius=self.cloth.radius)
+        return Elements(torch.tensor(unknowns), local, (k, torch.tensor(jams)))
+
+    def elements(self, term: str, q: Tensor) -> Elements:
+        """Of a conservative term; the contact force is that of q."""
+        return self.shear(self.contact(q)[1].detach()) if term == "shear" else getattr(self, term)
+
+    # -- inertia
+
+    def kinetic(self, q: Tensor, v: Tensor) -> Tensor:
+        e = self.inertial
+        return vmap(kinetic)(q[e.unknowns], v[e.unknowns], *e.parameters).sum()
+
+    def mass(self, q: Tensor, v: Tensor) -> Tensor:
+        e = self.inertial
+        blocks = vmap(hessian(kinetic, argnums=1))(q[e.unknowns], v[e.unknowns], *e.parameters)
+        return e.matrix(blocks, self.size)
+
+    # -- contact
+
+    def contact(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal [nodes, 3] and F_n [nodes], eq. 3; what the scene's terms press with."""
+        x = q[: 3 * self.nodes].reshape(self.nodes, 3)
+        at, left, right, up, down = (
+            [self.node(j + b, i + a) for j, i in self.crossings()]
+            for a, b in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
+        )
+        points = x[torch.tensor([at, left, right, up, down])]
+        centered = points - points.mean(dim=0)
+        covariance = torch.einsum("pca,pcb->cab", centered, centered)
+        n = torch.linalg.eigh(covariance)[1][:, :, 0]
+        side = torch.sum(n * torch.linalg.cross(x[right] - x[left], x[down] - x[up]), dim=1)
+        sign = torch.where(side < 0.0, -1.0, 1.0)
+        sign = sign * tensor([-1.0 if self.flipped[j][i] else 1.0 for j, i in self.crossings()])
+        normal = torch.zeros_like(x).index_put((torch.tensor(at),), n * sign.detach()[:, None])
+
+        load = torch.zeros(self.nodes, dtype=torch.float64)
+        for term, length in (("stretch", 2), ("bending", 3)):
+            if term not in self.scene.terms:
+                continue
+            for direction, sign in ((0, 1.0), (1, -1.0)):
+                yarns = getattr(self, term).of([d == direction for _, d, _ in self.chains(length)])
+                crimp = -sign * self.cloth.radius * normal if term == "bending" else torch.zeros_like(x)
+                moved = torch.cat([(x + crimp).ravel(), q[3 * self.nodes :]])
+                force = yarns.force(moved)[: 3 * self.nodes].reshape(self.nodes, 3)
+                load = load + 0.5 * sign * torch.sum(normal * force, dim=1)
+        return normal, torch.relu(load)
+
+    # -- forces
+
+    def force(self, term: str, q: Tensor, v: Tensor, anchor: Tensor) -> Tensor:
+        """[5 nodes]; nothing on (u, v) where nothing slides."""
+        force = getattr(self, f"_{term}_force", None)
+        result = force(q, v, anchor) if force else getattr(self, term).force(q)
+        x, s = result[: 3 * self.nodes], result[3 * self.nodes :]
+        return torch.cat([x, s * self.slides])
+
+    def _shear_force(self, q: Tensor, *_: Tensor) -> Tensor:
+        return self.shear(self.contact(q)[1]).force(q)
+
+    def _inertia_force(self, q: Tensor, v: Tensor, *_: Tensor) -> Tensor:
+        return grad(self.kinetic)(q, v)
+
+    def _mass_rate_force(self, q: Tensor, v: Tensor, *_: Tensor) -> Tensor:
+        return -jvp(lambda q: grad(self.kinetic, argnums=1)(q, v), (q,), (v,))[1]
+
+    def _wind_force(self, q: Tensor, v: Tensor, *_: Tensor) -> Tensor:
+        w = self.scene.wind
+        unknowns = torch.tensor([self.unknowns(*nodes) for nodes in self.triangles()])
+        velocity = tensor(w.velocity)
+        forces = vmap(lambda q, v: wind(q, v, velocity, w.density, w.drag))(q[unknowns], v[unknowns])
+        return torch.zeros_like(q).index_put((unknowns,), forces, accumulate=True)
+
+    def _applied_force(self, q: Tensor, *_: Tensor) -> Tensor:
+        unknowns = torch.tensor([self.unknowns(int(node)) for node in self.scene.force_nodes])
+        return torch.zeros_like(q).index_put((unknowns,), tensor(self.scene.force_path[0]), accumulate=True)
+
+    def _friction_force(self, q: Tensor, v: Tensor, anchor: Tensor) -> Tensor:
+        others = sum(self.force(t, q, v, anchor) for t in self.scene.terms if t not in ("mass", "friction"))
+        others = others[3 * self.nodes :] if isinstance(others, Tensor) else torch.zeros_like(anchor)
+        delta = q[3 * self.nodes :] - anchor
+        limit = self.cloth.friction * self.contact(q)[1].repeat_interleave(2)
+        spring = self.spring(delta, others, limit)
+        f = spring - self.cloth.friction_damping * v[3 * self.nodes :]
+        return torch.cat([torch.zeros_like(q[: 3 * self.nodes]), f])
+
+    def spring(self, delta: Tensor, others: Tensor, limit: Tensor) -> Tensor:
+        """Eq. 4 without damping; limit = μF_n."""
+        k, p = self.cloth.friction_stiffness, self.cloth.friction_sharpness
+        # The floor under μF_n: the spring's force at 1e-7 spacings.
+        scale = torch.ones_like(limit) if self.scene.published_scaling else limit + k * self.cloth.spacing * 1e-7
+        per_length = 1.0 if self.scene.published_scaling else k
+        sign = torch.tanh(p * delta * per_length / scale)
+        stuck = torch.tanh(p * (limit - torch.abs(others)) / scale)
+        return -(0.5 * (k * delta - sign * limit) * stuck + 0.5 * (k * delta + sign * limit))

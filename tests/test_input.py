@@ -1,0 +1,139 @@
+"""Bad input: every refusal names the argument, its value and what is allowed."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import warp_yarn as wy
+
+YARN = wy.paper.YARNS[1]
+PLAIN = wy.Weave.plain(rows=4, columns=4)
+CLOTH = wy.Cloth(PLAIN, yarns=[YARN])
+SCENE = wy.Scene(CLOTH)
+NAN = float("nan")
+
+
+def state(**replaced: object) -> wy.State:
+    n = CLOTH.nodes
+    arrays = {
+        "position": CLOTH.position.copy(),
+        "euler": CLOTH.euler,
+        "velocity": np.zeros((n, 3)),
+        "euler_velocity": np.zeros((n, 2)),
+    }
+    return wy.State(**{**arrays, **replaced})
+
+
+def swapped() -> np.ndarray:
+    """(u, v) with two crossings of the warp yarn in row 1 out of order."""
+    euler = CLOTH.euler.copy()
+    euler[5, 0], euler[6, 0] = euler[6, 0], euler[5, 0]
+    return euler
+
+
+def with_nan() -> np.ndarray:
+    position = CLOTH.position.copy()
+    position[7, 2] = NAN
+    return position
+
+
+REFUSED: dict[str, tuple[Callable, str]] = {
+    "density": (lambda: wy.Yarn(density=0.0, stretch=1.0, bend=1.0), r"density = 0\.0.*above 0"),
+    "stretch": (lambda: wy.Yarn(density=1.0, stretch=-1.0, bend=1.0), r"stretch = -1\.0.*at least 0"),
+    "bend": (lambda: wy.Yarn(density=1.0, stretch=1.0, bend=NAN), r"bend = nan.*finite"),
+    "not a number": (lambda: wy.Yarn(density="thick", stretch=1.0, bend=1.0), "density = 'thick'"),
+    "color": (lambda: wy.Yarn(density=1, stretch=1, bend=1, color=(2, 0, 0)), r"color.*from 0 to 1"),
+    "rows": (lambda: wy.Weave.plain(rows=2, columns=5), r"rows = 2.*at least 3"),
+    "columns": (lambda: wy.Weave.twill(rows=5, columns=2.5), r"columns = 2\.5.*whole"),
+    "draft size": (lambda: wy.Weave(np.zeros((3, 2))), r"3 × 2.*at least 3 × 3"),
+    "draft values": (lambda: wy.Weave(np.full((4, 4), 2)), "0 and 1"),
+    "draft text": (lambda: wy.Weave("plain"), "0 and 1"),
+    "weave": (lambda: wy.Cloth("plain", yarns=[YARN]), r"weave = 'plain'.*must be a Weave"),
+    "no yarns": (lambda: wy.Cloth(PLAIN, yarns=[]), "at least one Yarn"),
+    "warp length": (lambda: wy.Cloth(PLAIN, yarns=[YARN], warp=[0]), r"warp.*1 yarns, must be of 4"),
+    "warp material": (lambda: wy.Cloth(PLAIN, yarns=[YARN], warp=[0, 0, 1, 0]), r"warp names material 1.*0 to 0"),
+    "spacing": (lambda: wy.Cloth(PLAIN, yarns=[YARN], spacing=0.0), r"spacing = 0\.0.*above 0"),
+    "radius": (lambda: wy.Cloth(PLAIN, yarns=[YARN], radius=float("inf")), r"radius = inf.*finite"),
+    "thick yarns": (lambda: wy.Cloth(PLAIN, yarns=[YARN], radius=6e-4), r"radius = 0\.0006.*half the spacing"),
+    "pose": (lambda: wy.Cloth(PLAIN, yarns=[YARN], pose="diagonal"), r"pose = 'diagonal'.*upright, flat"),
+    "pose shape": (lambda: wy.Cloth(PLAIN, yarns=[YARN], pose=np.zeros((3, 3))), r"pose has shape.*\(16, 3\)"),
+    "corner": (lambda: CLOTH.corners("left"), "which = 'left'"),
+    "node": (lambda: CLOTH.node(4, 0), "outside a cloth of 4 × 4"),
+    "pin": (lambda: wy.Scene(CLOTH, pins=[16]), r"pins names node 16.*0 to 15"),
+    "pin twice": (lambda: wy.Scene(CLOTH, pins=[1, 1]), "twice"),
+    "pin stiffness": (lambda: wy.Scene(CLOTH, pins=[1], pin_stiffness=0.0), r"pin_stiffness = 0\.0.*above 0"),
+    "pin path": (lambda: wy.Scene(CLOTH, pins=[1], pin_path=np.zeros((3, 2, 3))), r"pin_path has shape.*\(any, 1, 3\)"),
+    "wind": (lambda: wy.Wind(velocity=(0, NAN, 0)), r"wind velocity\[1\] is nan"),
+    "wind type": (lambda: wy.Scene(CLOTH, wind=(0, 5, 0)), "must be a Wind"),
+    "gravity": (lambda: wy.Scene(CLOTH, gravity=(0, 0)), r"gravity has shape \(2,\), must be \(3\)"),
+    "force node": (lambda: wy.Scene(CLOTH, forces={99: (0, 0, 1)}), "forces names node 99"),
+    "force shape": (lambda: wy.Scene(CLOTH, forces={3: (0, 0)}), r"forces\[3\] has shape"),
+    "term": (lambda: wy.Scene(CLOTH, terms=["tension"]), r"terms = 'tension'.*stretch"),
+    "term of sliding": (lambda: wy.Scene(CLOTH, sliding=False, terms=["friction"]), "do not slide"),
+    "term without wind": (lambda: wy.Scene(CLOTH, terms=["wind"]), "wind is None"),
+    "terms text": (lambda: wy.Scene(CLOTH, terms="stretch"), "list of names"),
+    "step": (lambda: wy.Simulator(SCENE, step=0.0), r"step = 0\.0.*above 0"),
+    "device": (lambda: wy.Simulator(SCENE, device="tpu"), r"device = 'tpu'.*cpu"),
+    "precision": (lambda: wy.Simulator(SCENE, precision="half"), r"precision = 'half'.*double, single"),
+    "tolerance": (lambda: wy.Simulator(SCENE, tolerance=-1), r"tolerance = -1.*above 0"),
+    "scene": (lambda: wy.Simulator(CLOTH), "must be a Scene"),
+    "steps": (lambda: wy.Simulator(SCENE).run(-1), r"steps = -1.*at least 0"),
+    "state shape": (lambda: wy.Simulator(SCENE).forces(state(velocity=np.ones((4, 3)))), r"has shape \(4, 3\)"),
+    "state NaN": (lambda: wy.Simulator(SCENE).forces(state(position=with_nan())), r"state\.position\[7, 2\] is nan"),
+    "state order": (lambda: wy.Simulator(SCENE).forces(state(euler=swapped())), r"Δs = .* between nodes 5 and 6"),
+    "contact": (lambda: wy.Simulator(wy.Scene(CLOTH, terms=["stretch"])).contact(), "no contact"),
+    "recording": (lambda: wy.Trajectory.load(__file__), "not a recording"),
+    "no recording": (lambda: wy.Trajectory.load("nowhere.npz"), "no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(case: str) -> None:
+    call, message = REFUSED[case]
+    with pytest.raises(wy.InputError, match=message) as error:
+        call()
+    assert isinstance(error.value, wy.WarpYarnError) and isinstance(error.value, ValueError)
+
+
+def test_setting_a_state_refuses_sliding_where_yarns_do_not() -> None:
+    rates = np.zeros((CLOTH.nodes, 2))
+    rates[5] = 1.0
+    with pytest.raises(wy.InputError, match="do not slide"):
+        wy.Simulator(wy.Scene(CLOTH, sliding=False)).state = state(euler_velocity=rates)
+    rates[0] = 1.0
+    with pytest.raises(wy.InputError, match="border"):
+        wy.Simulator(SCENE).state = state(euler_velocity=rates)
+
+
+def test_a_step_that_is_not_finite_says_where_and_keeps_the_frames() -> None:
+    velocity = np.zeros((CLOTH.nodes, 3))
+    velocity[6] = 1e200
+    sim = wy.Simulator(SCENE)
+    sim.state = state(velocity=velocity)
+    with pytest.raises(wy.SimulationError, match=r"step 1 .*node .*not finite.*smaller step") as error:
+        sim.run(10)
+    assert error.value.step == 1 and len(error.value.trajectory) == 1
+    assert 0 <= error.value.node < CLOTH.nodes and error.value.term in SCENE.terms
+    assert np.array_equal(sim.state.velocity, velocity)  # it stays at the last good frame
+
+
+def test_crossings_that_meet_stop_the_run() -> None:
+    """Two crossings of a yarn that fly at each other with nothing to keep them apart."""
+    rates = np.zeros((CLOTH.nodes, 2))
+    rates[5, 0], rates[6, 0] = 0.2, -0.2
+    sim = wy.Simulator(wy.Scene(CLOTH, gravity=None, terms=["inertia"]))
+    sim.state = state(euler_velocity=rates)
+    with pytest.raises(wy.SimulationError, match=r"Δs .* reached 0") as error:
+        sim.run(20)
+    # 1 mm closes at 0.4 mm a step; the yarn's other crossings share the momentum, some hundredths of a millimetre
+    assert error.value.step == 3 and error.value.node == 5 and len(error.value.trajectory) == 3
+    gaps = error.value.trajectory.euler[:, 6, 0] - error.value.trajectory.euler[:, 5, 0]
+    assert gaps == pytest.approx([1e-3, 6e-4, 2e-4], abs=5e-5)
+    assert len(sim.run(0)) == 1  # and it can go on from there
+
+
+def test_a_solver_that_does_not_converge_stops_the_run() -> None:
+    sim = wy.Simulator(wy.Scene(CLOTH, wind=wy.Wind(velocity=(0, 5, 0))), max_iterations=1, tolerance=1e-12)
+    with pytest.raises(wy.SimulationError, match=r"stopped after 1 iterations at a residual of .*above its tolerance"):
+        sim.run(5)
