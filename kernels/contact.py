@@ -89,7 +89,8 @@ def define_normal(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     plane_normal = functions(variant).plane_normal
 
-    @wp.kernel(module=variant.module("terms"))
+    # a module of its own: drawing a recording needs this kernel alone, and not the minute that all terms compile
+    @wp.kernel(module=variant.module("contact"))
     def contact_normal(
         crossing_node: wp.array(dtype=int),
         crossing_neighbours: wp.array(dtype=wp.vec4i),

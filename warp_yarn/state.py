@@ -85,6 +85,7 @@ class Trajectory:
         """Writes an .npz file with the cloth and every frame; it appears whole or not at all."""
         cloth = self.cloth
         yarns = np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns])
+        colors = np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns])
         numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
         with whole_file(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
@@ -92,6 +93,7 @@ class Trajectory:
                 draft=cloth.weave.flipped,
                 weave=cloth.weave.name,
                 yarns=yarns,
+                colors=colors,
                 warp=cloth.warp,
                 weft=cloth.weft,
                 rest=cloth.position,
@@ -105,7 +107,10 @@ class Trajectory:
         """Reads what ``save`` wrote; an InputError says what is wrong with the file."""
         try:
             with np.load(path) as data:
-                yarns = [Yarn(density=d, stretch=s, bend=b) for d, s, b in data["yarns"].tolist()]
+                yarns = [
+                    Yarn(density=d, stretch=s, bend=b, color=None if np.isnan(color).any() else tuple(color.tolist()))
+                    for (d, s, b), color in zip(data["yarns"].tolist(), data["colors"], strict=True)
+                ]
                 cloth = Cloth(
                     Weave(data["draft"], str(data["weave"])),
                     yarns=yarns,
