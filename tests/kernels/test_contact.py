@@ -89,14 +89,13 @@ def test_nodes_on_one_line_leave_everything_finite() -> None:
 def test_adjoint_of_the_normal(name: str, state_name: str) -> None:
     """Written by hand in the kernel; held to differences of the normal along a random direction."""
     case = Case(name, state_name, True)
-    sim, n = case.simulator(*PRESSING), case.cloth.nodes
-    a, scalars = sim.arrays, wp.types.vector(3, wp.float64)
-    position = wp.array(case.state.position, dtype=scalars, requires_grad=True)
-    normal = wp.zeros(n, dtype=scalars, requires_grad=True)
+    sim, n, vec3 = case.simulator(*PRESSING), case.cloth.nodes, wp.types.vector(3, wp.float64)
+    position = wp.array(case.state.position, dtype=vec3, requires_grad=True)
+    normal = wp.zeros(n, dtype=vec3, requires_grad=True)
     seed = np.random.default_rng(3).normal(size=(n, 3))
     with wp.Tape() as tape:
         sim.model.launch("contact_normal", "crossings", position=position, normal=normal)
-    tape.backward(grads={normal: wp.array(seed, dtype=scalars)})
+    tape.backward(grads={normal: wp.array(seed, dtype=vec3)})
     gradient = position.grad.numpy()
 
     for direction in case.directions(3, "x"):

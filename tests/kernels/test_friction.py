@@ -136,7 +136,7 @@ def test_slack_crossing_slides_freely(delta: float) -> None:
 
 
 def test_floor_under_the_limit() -> None:
-    """F_n = 0: the floor, the spring's force at 1e-7 spacings, takes the place of μF_n in the arguments of both tanh."""
+    """F_n = 0: the floor, the spring's force at 1e-7 spacings, stands for μF_n in the arguments of both tanh."""
     sim, state, _ = saddle(flipped=1)
     floor = K_F * 1e-7 * SPACING
     pushed = slid(state, 0, 1e-11)
