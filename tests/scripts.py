@@ -1,10 +1,13 @@
-"""Scripts as modules: those of scenes/ and benchmarks/, which are no packages."""
+"""Scripts as modules: those of scenes/ and benchmarks/, which are no packages; and how to look at what scenes make."""
 
 import importlib.util
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from unittest import mock
+
+from pxr import Usd, UsdGeom
 
 ROOT = Path(__file__).parents[1]
 
@@ -22,3 +25,18 @@ def load(path: str) -> ModuleType:
         spec.loader.exec_module(module)
     del sys.modules["common"]
     return module
+
+
+def exit_code(script: ModuleType, arguments: Sequence[str]) -> int:
+    """What running a scene with these arguments would return."""
+    try:
+        return script.command(script.main, arguments)
+    except SystemExit as exit:  # argparse
+        return exit.code
+
+
+def samples(path: Path) -> list[int]:
+    """Number of frames of each yarn material in a USD file."""
+    stage = Usd.Stage.Open(str(path))
+    shapes = [UsdGeom.PointBased(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)]
+    return [shape.GetPointsAttr().GetNumTimeSamples() for shape in shapes]

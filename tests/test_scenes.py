@@ -3,27 +3,12 @@
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from scripts import load
+from scripts import exit_code, load, samples
 
 import warp_yarn as wy
 from warp_yarn.state import FIELDS
 
 hang = load("scenes/hang.py")
-
-
-def exit_code(arguments):
-    """What ``python scenes/hang.py`` would return."""
-    try:
-        return hang.command(hang.main, arguments)
-    except SystemExit as exit:  # argparse
-        return exit.code
-
-
-def samples(path):
-    """Number of frames of each yarn material in a USD file."""
-    stage = Usd.Stage.Open(str(path))
-    shapes = [UsdGeom.PointBased(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)]
-    return [shape.GetPointsAttr().GetNumTimeSamples() for shape in shapes]
 
 
 @pytest.fixture
@@ -81,7 +66,7 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
     record = str(tmp_path / "first.npz")
     hang.main(["--size", "5", "--steps", "1", "--output", str(usd), "--record", record])
     for option in (["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"]):
-        assert exit_code(["--resume", record, *option]) == 2
+        assert exit_code(hang, ["--resume", record, *option]) == 2
         assert option[0] in capsys.readouterr().err
 
 
@@ -94,7 +79,7 @@ def test_a_failing_simulation_leaves_the_frames_before_it(usd, capsys):
     assert samples(usd) == [failure.value.step] * 2
     usd.unlink()
     capsys.readouterr()
-    assert exit_code(arguments) == 1
+    assert exit_code(hang, arguments) == 1
     assert samples(usd) == [failure.value.step] * 2
     told = capsys.readouterr()
     assert f"The simulation failed in step {failure.value.step}" in told.err
@@ -111,7 +96,7 @@ def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
         return run(simulator, steps)
 
     monkeypatch.setattr(wy.Simulator, "run_chunk", interrupted)
-    assert exit_code(["--size", "5", "--steps", "10", "--output", str(usd)]) == 130
+    assert exit_code(hang, ["--size", "5", "--steps", "10", "--output", str(usd)]) == 130
     assert samples(usd) == [4, 4]
     assert "Ctrl-C" in capsys.readouterr().err
 
@@ -139,7 +124,7 @@ def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
 )
 def test_wrong_arguments_end_with_code_2_and_a_message(arguments, named, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert exit_code(arguments) == 2
+    assert exit_code(hang, arguments) == 2
     told = capsys.readouterr()
     assert named in told.err
     assert "Traceback" not in told.err
@@ -148,7 +133,7 @@ def test_wrong_arguments_end_with_code_2_and_a_message(arguments, named, tmp_pat
 
 def test_a_folder_that_cannot_be_made_ends_with_code_2(tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert exit_code(["--output", str(tmp_path / "file" / "hang.usdc")]) == 2
+    assert exit_code(hang, ["--output", str(tmp_path / "file" / "hang.usdc")]) == 2
     assert "file" in capsys.readouterr().err
 
 
