@@ -20,6 +20,7 @@ from . import (
     pins,
     shear,
     solver,
+    stage,
     step,
     stretch,
     wind,
@@ -58,6 +59,6 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant)
         if term.contact_load is not None:
             kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
-    for part in (step, solver, history, adjoint):
+    for part in (step, solver, history, adjoint, stage):
         kernels |= vars(part.define(variant))
     return kernels

@@ -109,7 +109,7 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """Adjoint of an exact pin's velocity: its row of seed − A λ, with q = A λ."""
         i = pin_node[wp.tid()]
-        solution_grad[i] = seed[i] - q_x[i]
+        solution_grad[i] = solution_grad[i] + seed[i] - q_x[i]
 
     return SimpleNamespace(
         adjoint_right_hand_side=adjoint_right_hand_side, matrix_adjoint=matrix_adjoint, held_adjoint=held_adjoint

@@ -12,8 +12,8 @@ import warp as wp
 
 from .variant import Variant
 
-NOT_FINITE, ORDER_LOST, NOT_CONVERGED = 1, 2, 3
-"""What went wrong in a step, in ``status[0]``; ``status[1]`` is the node, ``status[2]`` the step of its chunk."""
+NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED = 1, 2, 3, 4
+"""What went wrong in a step, in ``status[0]``; ``status[1]`` is the node or -1, ``status[2]`` the step of its chunk."""
 
 
 @functools.cache

@@ -20,19 +20,19 @@ def cloth(rows: int = 4, columns: int = 5, weave: str = "plain", **options: floa
     return wy.Cloth(wy.WEAVES[weave](rows=rows, columns=columns), yarns=YARNS, **options)
 
 
-def jittered(cloth: wy.Cloth, sliding: bool = True) -> dict[str, torch.Tensor]:
-    """A state away from every kink: bent, sheared, stretched and slack, moving and sliding."""
+def jittered(cloth: wy.Cloth, sliding: bool = True, size: float = 1.0) -> dict[str, torch.Tensor]:
+    """A state away from every kink: bent, sheared, stretched and slack, moving and sliding; size 1 is violent."""
     random = np.random.default_rng(3)
     crossing = (cloth.topology.is_crossing != 0)[:, None]
     nodes = cloth.nodes
     state = {
-        "position": cloth.position + 1e-4 * random.standard_normal((nodes, 3)),
-        "velocity": 0.05 * random.standard_normal((nodes, 3)),
+        "position": cloth.position + size * 1e-4 * random.standard_normal((nodes, 3)),
+        "velocity": size * 0.05 * random.standard_normal((nodes, 3)),
     }
     if sliding:
-        state["euler"] = cloth.euler + 5e-5 * crossing * random.standard_normal((nodes, 2))
-        state["euler_velocity"] = 0.01 * crossing * random.standard_normal((nodes, 2))
-        state["anchor"] = state["euler"] + 2e-8 * random.standard_normal((nodes, 2))
+        state["euler"] = cloth.euler + size * 5e-5 * crossing * random.standard_normal((nodes, 2))
+        state["euler_velocity"] = size * 0.01 * crossing * random.standard_normal((nodes, 2))
+        state["anchor"] = state["euler"] + size * 2e-8 * random.standard_normal((nodes, 2))
     return {name: torch.tensor(value) for name, value in state.items()}
 
 

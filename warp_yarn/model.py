@@ -24,13 +24,15 @@ PATHS = ("pin_target", "applied_force")
 PRECONDITIONERS = ("incomplete", "jacobi")
 PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-8, "single": 1e-4}
+NEWTON = {"double": 1e-6, "single": 1e-4}
 
 
 class Model:
     """A scene on the device.
 
     Args:
-        scene, step, device, precision, preconditioner, tolerance, max_iterations: as of the Simulator.
+        scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations: as of the
+            Simulator.
 
     Attributes:
         arrays: by the names that kernels use.
@@ -47,6 +49,7 @@ class Model:
         precision: str,
         preconditioner: str,
         tolerance: float | None,
+        newton_tolerance: float | None,
         max_iterations: int | None,
     ):
         if not isinstance(scene, Scene):
@@ -56,6 +59,9 @@ class Model:
         self.precision = choice("precision", precision, PRECISIONS)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
         self.tolerance = TOLERANCES[precision] if tolerance is None else number("tolerance", tolerance, above=0.0)
+        self.newton_tolerance = number(
+            "newton_tolerance", NEWTON[precision] if newton_tolerance is None else newton_tolerance, above=0.0
+        )
         degrees = scene.cloth.nodes * (5 if scene.sliding else 3)
         most = max(1000, degrees) if max_iterations is None else max_iterations
         self.max_iterations = whole("max_iterations", most, least=1)
@@ -79,16 +85,25 @@ class Model:
         """Launches a kernel by its name (see ``Arrays.launch``)."""
         self.arrays.launch(self.kernels[kernel], elements, **replaced)
 
-    def assemble(self, *, matrix: bool = True) -> None:
-        """Fills forces, momentum and matrix from the state: the terms of the scene, in their order."""
+    def assemble(self, *, matrix: bool = True, mass: dict[str, wp.array] | None = None, **replaced: Any) -> None:
+        """Fills forces, momentum, matrix and right-hand side from the state: the terms of the scene, in their order.
+
+        Args:
+            matrix: whether to fill the matrix.
+            mass: arrays to take in place of the velocities for the momentum; D q̇ is then left out of it.
+            replaced: arrays to take in place of others for the right-hand side.
+        """
         a = self.arrays
+        # Without its place in the momentum, D q̇ goes where the solver works.
+        others = {} if mass is None else {"momentum": a["q_x"], "euler_momentum": a["q_s"]}
         a.zero(*SUMS)
         if matrix:
             a.zero(*MATRIX)
         self.press()
         for term in a.terms:
-            self.launch(term.name, term.elements, matrix=int(matrix))
-        self.launch("right_hand_side", "nodes")
+            arrays = (mass or {}) if term.name == "mass" else others
+            self.launch(term.name, term.elements, matrix=int(matrix), **arrays)
+        self.launch("right_hand_side", "nodes", **replaced)
 
     def press(self) -> None:
         """Fills contact normals and loads, where a term of the scene needs them."""
@@ -100,18 +115,18 @@ class Model:
                 if term.contact_load is not None:
                     self.launch(f"{term.name}_contact_load", term.elements)
 
-    def prescribe(self) -> None:
+    def prescribe(self, **replaced: Any) -> None:
         """Gives exact pins the velocity that brings them to their place."""
         if self.held:
-            self.launch("prescribe", "pins")
+            self.launch("prescribe", "pins", **replaced)
 
     def solve(self, **replaced: Any) -> None:
-        """The conjugate gradient on the assembled matrix, with other vectors where they are given."""
+        """The conjugate gradient on the assembled matrix, with other vectors or numbers where they are given."""
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
         numbers = {"tolerance": self.tolerance, "most_iterations": self.max_iterations}
-        self.launch(f"{self.preconditioner}_conjugate_gradient", 1, **numbers, **replaced)
+        self.launch(f"{self.preconditioner}_conjugate_gradient", 1, **{**numbers, **replaced})
 
     def drag_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""

@@ -26,11 +26,14 @@ class Simulator:
     Args:
         scene: the scene.
         step: h, time step [s], above 0.
-        integrator: the method, by name: "linear" is eq. 2 of the paper.
+        integrator: the method: "linear" (eq. 2 of the paper, order 1), "implicit-euler" (order 1, one implicit stage a
+            step) or "sdirk2" (order 2, two implicit stages); see ``warp_yarn/integrators``.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
         preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (see ``kernels/solver.py``).
         tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-8, in
+            single precision 1e-4. Within an implicit stage it is that of the adjoint's solves alone.
+        newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms; None: 1e-6, in
             single precision 1e-4.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
         chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
@@ -51,6 +54,7 @@ class Simulator:
         precision: str = "double",
         preconditioner: str = "incomplete",
         tolerance: float | None = None,
+        newton_tolerance: float | None = None,
         max_iterations: int | None = None,
         chunk: int | None = None,
     ):
@@ -62,6 +66,7 @@ class Simulator:
             precision=precision,
             preconditioner=preconditioner,
             tolerance=tolerance,
+            newton_tolerance=newton_tolerance,
             max_iterations=max_iterations,
         )
         self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
@@ -196,9 +201,9 @@ class Simulator:
         self._upload(last)
         term = self._blame(last, node)
         columns = self.scene.cloth.weave.columns
-        where = (
-            f"step {k} (t = {k * self.step_size:g} s): at node {node} (row {node // columns}, column {node % columns})"
-        )
+        where = f"step {k} (t = {k * self.step_size:g} s):"
+        if node >= 0:
+            where += f" at node {node} (row {node // columns}, column {node % columns})"
         what = {
             step.NOT_FINITE: "a value is not finite",
             step.ORDER_LOST: "Δs to the next crossing of the yarn reached 0",
@@ -206,9 +211,14 @@ class Simulator:
                 f"the solver stopped after {iterations} iterations at a residual of {residual:.1e}, "
                 f"above its tolerance of {self.model.tolerance:.1e}"
             ),
+            step.STALLED: (
+                f"Newton's iteration stopped at a residual of {residual:.1e}, "
+                f"above its tolerance of {self.model.newton_tolerance:.1e}"
+            ),
         }[code]
         raise SimulationError(
-            f"{where} {what}. The largest term there is {term!r}. Try a smaller step than {self.step_size:g} s; "
+            f"{where} {what}. The largest term {'there ' if node >= 0 else ''}is {term!r}. "
+            f"Try a smaller step than {self.step_size:g} s; "
             f"the {len(trajectory)} frames before are in this error's trajectory",
             step=k,
             node=node,
@@ -217,12 +227,13 @@ class Simulator:
         )
 
     def _blame(self, state: State, node: int) -> str | None:
-        """The term with the largest, or a not finite, force on a node."""
+        """The term with the largest, or a not finite, force on a node; on all of them where node is -1."""
         size = {}
         with np.errstate(all="ignore"):
             forces = self.forces(state)
         for name, (force, euler_force) in forces.items():
-            total = float(np.abs(force[node]).sum() + np.abs(euler_force[node]).sum())
+            at = node if node >= 0 else slice(None)
+            total = float(np.abs(force[at]).sum() + np.abs(euler_force[at]).sum())
             size[name] = total if np.isfinite(total) else np.inf
         return max(size, key=lambda name: size[name], default=None)
 

@@ -4,7 +4,9 @@ A method is a class that says its ``name``, ``order`` and, in its docstring, its
 the model's state arrays; ``prepare_adjoint`` and ``retreat`` are its reverse (``linear.py`` says what they leave).
 """
 
+from .implicit_euler import ImplicitEuler
 from .linear import LinearlyImplicitEuler
+from .sdirk2 import SDIRK2
 
-INTEGRATORS = {method.name: method for method in (LinearlyImplicitEuler,)}
+INTEGRATORS = {method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, SDIRK2)}
 """Every method by its name."""

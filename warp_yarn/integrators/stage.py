@@ -1,0 +1,403 @@
+"""What implicit methods share: a stage, solved by Newton's iteration, and its adjoint (``kernels/stage.py``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.step import STALLED
+from ..model import SUMS, Model
+
+BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
+"""Arrays within an evaluation of the residual whose adjoints start at 0."""
+MOVED = ("position", "euler", "velocity", "euler_velocity", "increment", "euler_increment")
+"""Arrays of the stage that w moves."""
+
+FORWARD = ("_begin", "_evaluate", "_solve_direction", "_correct", "_next_base", "_end")
+
+INNER_TOLERANCE = 1e-3
+"""Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
+would not come nearer to the stage's."""
+MOST_ITERATIONS = 200
+"""Of Newton's iteration, which takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so that violent
+sliding brings them to dozens."""
+MOST_PARTS = 100
+"""Of GMRES, each kept as a vector."""
+SHORTEST_STEP = 1.0 / 64.0
+"""Of the line search."""
+
+
+def _values(array: wp.array) -> wp.array:
+    """The same memory without the gradient."""
+    return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, copy=False)
+
+
+class StageMethod:
+    """A method whose step is one or two implicit stages of size η = fraction · h, the last of which ends it.
+
+    The first stage starts from the present state (q, q̇); a second one, of SDIRK type, from q + (h − η) w₁ and
+    q̇ + (h − η) (w₁ − q̇)/η.
+
+    Newton's iteration ends where ‖r‖ ≤ newton_tolerance · ‖w‖, in the norms of ``measure``. Along δ it takes a full
+    step unless that overshoots: r·δ is minus the slope of the energy that a stage minimizes, where there is one, and
+    must not turn to more than 0.9 of itself with the other sign, or else ‖r‖ must fall. (That it always falls is too
+    much to ask of yarns that buckle.) Nor may crossings change their order.
+    """
+
+    name: str
+    order: int
+    fraction: float
+    stages: int
+
+    def __init__(self, model: Model):
+        self.model = model
+        a, h = model.arrays, model.step_size
+        eta = self.fraction * h
+        vec3, scalar, n = a.variant.vec3, a.variant.scalar, a["nodes"]
+        sliding = model.scene.sliding
+        for name in ("base_position", "base_velocity", "increment", "direction", "solution_before"):
+            a[name] = a.zeros(n, vec3)
+        for name in ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before"):
+            a[name] = a.zeros(2 * n, scalar) if sliding else None
+        a["base_euler"] = a.zeros(2 * n, scalar)
+        a["norms"] = a.zeros(3, scalar)
+        numbers = {"stage_size": eta, "carried_time": h - eta, "carried_rate": (h - eta) / eta}
+        for name, value in {**numbers, "unit": 1.0, "step_length": 1.0, "shortest": 1.0}.items():
+            a[name] = a.numbers(value)
+        model.set_weights(1.0, eta, eta * eta)
+        self.iterations = 0
+        """Newton iterations of the last step."""
+        self._graphs: dict[str, Any] = {}
+
+    # -- graphs ------------------------------------------------------------------------------------------------------
+
+    def _run(self, part: Callable[[], None]) -> None:
+        """Launches a part of the step, captured at its first call."""
+        name = part.__name__
+        if name not in self._graphs:
+            with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
+                part()
+            self._graphs[name] = capture.graph
+        wp.capture_launch(self._graphs[name])
+
+    def _copy(self, **targets: str) -> None:
+        """Copies arrays: target=source, those that the scene has; not their gradients, as wp.copy would by itself."""
+        a = self.model.arrays
+        for target, source in targets.items():
+            if a[target] is not None:
+                wp.copy(_values(a[target]), _values(a[source]))
+
+    # -- forward -----------------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Makes a step, and records it."""
+        self.iterations = 0
+        self._run(self._begin)
+        for stage in range(self.stages):
+            if stage:
+                self._run(self._next_base)
+            self._newton()
+        self._run(self._end)
+
+    def _next_base(self) -> None:
+        self.model.launch("next_base", "nodes")
+
+    def _begin(self) -> None:
+        """The stage starts from the present state, at the present velocity."""
+        model = self.model
+        model.take_inputs()
+        self._copy(solution="velocity", euler_solution="euler_velocity")
+        model.prescribe()
+        self._set_base()
+
+    def _set_base(self) -> None:
+        self._copy(
+            base_position="position",
+            base_euler="euler",
+            base_velocity="velocity",
+            base_euler_velocity="euler_velocity",
+        )
+
+    def _evaluate(self) -> None:
+        """The residual and the matrix at w, and how large the residual is."""
+        model, a = self.model, self.model.arrays
+        model.launch("enter_stage", "nodes")
+        self._assemble(matrix=True)
+        model.launch("precondition", "nodes")
+        model.launch("measure", 1, vector=a["rhs"], euler_vector=a["euler_rhs"])
+        if model.scene.sliding:
+            a["shortest"].fill_(np.inf)
+            model.launch("shortest_segment", "segments")
+
+    def _assemble(self, *, matrix: bool) -> None:
+        a = self.model.arrays
+        mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
+        self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
+
+    def _solve_direction(self) -> None:
+        """δ, from A δ = r."""
+        a = self.model.arrays
+        a.zero("direction", "euler_direction")
+        self._copy(solution_before="solution", euler_solution_before="euler_solution")
+        self.model.solve(tolerance=INNER_TOLERANCE, solution=a["direction"], euler_solution=a["euler_direction"])
+
+    def _correct(self) -> None:
+        self.model.launch("correct", "nodes")
+        self._evaluate()
+
+    def _newton(self) -> None:
+        a = self.model.arrays
+        self._run(self._evaluate)
+        size, scale, _ = a["norms"].numpy()
+        for _ in range(MOST_ITERATIONS):
+            if size <= self.model.newton_tolerance * scale or not np.isfinite(size):
+                break
+            self._run(self._solve_direction)
+            slope, length = self._slope(), 1.0
+            while length >= SHORTEST_STEP:
+                a["step_length"].fill_(length)
+                self._run(self._correct)
+                next_size, scale, next_slope = a["norms"].numpy()
+                falls = next_size < size or next_slope > -0.9 * slope
+                if falls and a["shortest"].numpy()[0] > 0.0:
+                    break
+                length *= 0.5
+            else:
+                break
+            size = next_size
+            self.iterations += 1
+        # what rounding leaves cannot be taken away
+        if not size <= max(self.model.newton_tolerance, 1e4 * self._rounding) * scale:
+            self._stall(size / scale)
+
+    def _slope(self) -> float:
+        """r·δ, that is δ·A δ to the inner tolerance: how fast r falls along δ."""
+        a = self.model.arrays
+        total = float((a["rhs"].numpy() * a["direction"].numpy()).sum())
+        if self.model.scene.sliding:
+            total += float((a["euler_rhs"].numpy() * a["euler_direction"].numpy()).sum())
+        return total
+
+    @property
+    def _rounding(self) -> float:
+        return 1e-16 if self.model.precision == "double" else 1e-7
+
+    def _stall(self, residual: float) -> None:
+        a = self.model.arrays
+        a["residual"].fill_(float(residual))
+        a["status"].assign(np.array([STALLED, -1, 0], dtype=np.int32))
+
+    def _end(self) -> None:
+        model = self.model
+        model.drag_anchor("euler", "anchor")
+        model.launch("count", 1, by=1)
+        model.launch("record", "nodes")
+
+    # -- adjoint -----------------------------------------------------------------------------------------------------
+
+    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[], None]) -> None:
+        """As of LinearlyImplicitEuler."""
+        model, a = self.model, self.model.arrays
+        vec3, scalar, n, sliding = a.variant.vec3, a.variant.scalar, a["nodes"], model.scene.sliding
+        if "seed" not in a:
+            for name in ("seed", "stage_adjoint", "zero"):
+                a[name] = a.zeros(n, vec3)
+                a[f"euler_{name}"] = a.zeros(2 * n, scalar) if sliding else None
+            a["euler_next"] = a.zeros(2 * n, scalar) if sliding else None
+            a["first_solution"] = a.zeros(n, vec3)
+            a["euler_first_solution"] = a.zeros(2 * n, scalar) if sliding else None
+            a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, scalar)
+        base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
+        a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
+        if sliding:
+            a["euler_next"].grad = a["base_euler"].grad
+        self.tape, self.anchor_tape, self.held_tape = wp.Tape(), wp.Tape(), wp.Tape()
+        with self.tape:
+            self._assemble(matrix=False)
+        with self.anchor_tape:
+            model.drag_anchor("euler_next", "anchor_next")
+        with self.held_tape:
+            model.prescribe(position=a["base_position"])
+        self._around = before, after
+        self._graphs = {name: graph for name, graph in self._graphs.items() if name in FORWARD}
+
+    def retreat(self) -> None:
+        """As of LinearlyImplicitEuler; (−∂r/∂w)ᵀ λ = w̄ is solved to the linear tolerance, with the exact derivative."""
+        self._run(self._recall)
+        self._run(self._enter_last)
+        self._solve_adjoint()
+        if self.stages == 2:
+            self._run(self._enter_first)
+            self._solve_adjoint()
+        self._run(self._finish)
+
+    def _recall(self) -> None:
+        """The step that ends at the present frame; the running adjoints go to the base."""
+        model, a = self.model, self.model.arrays
+        before, _ = self._around
+        before()
+        model.launch("count", 1, by=-1)
+        model.launch("recall", "nodes")
+        model.take_inputs()
+        self._set_base()
+        if self.stages == 2:
+            model.launch("recall_first_stage", "nodes")
+            first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
+            model.launch("next_base", "nodes", **first)
+        for name in ("position", "euler", "velocity", "euler_velocity"):
+            if a[name] is not None:
+                wp.copy(a[f"base_{name}"].grad, a[name].grad)
+        a.zero_grad("solution")
+
+    def _enter_last(self) -> None:
+        """The stage that ended the step, and w̄ of the step's end."""
+        model, a = self.model, self.model.arrays
+        self._enter()
+        if a["anchor"] is not None:
+            wp.copy(a["anchor_next"].grad, a["anchor"].grad)
+            a.zero_grad("anchor", "rhs", "euler_rhs")
+            self.anchor_tape.backward()
+            self.tape.backward()
+        model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
+
+    def _enter_first(self) -> None:
+        """The stage before it, and w̄ of what it carried to the next."""
+        model, a = self.model, self.model.arrays
+        model.launch("recall", "nodes")
+        self._set_base()
+        self._copy(solution="first_solution", euler_solution="euler_first_solution")
+        self._enter()
+        model.launch("carry_adjoint", "nodes", time=a["carried_time"], rate=a["carried_rate"])
+
+    def _enter(self) -> None:
+        self.model.arrays.zero_grad(*MOVED, *BETWEEN)
+        self.model.launch("enter_stage", "nodes")
+        self._assemble(matrix=True)
+        self.model.launch("precondition", "nodes")
+
+    def _solve_adjoint(self) -> None:
+        """λ of (−∂r/∂w)ᵀ λ = ρ₀, by GMRES with the preconditioner A, and reverse mode with all of it.
+
+        A alone, as in Newton's iteration, would do for ordinary motion; where yarns slide fast it need not contract.
+        """
+        a = self.model.arrays
+        self._run(self._gather)
+        rho = self._vector("seed")
+        # Products with the derivative run all of reverse mode: what it adds to is put back, and added to at the end.
+        kept = {name: a[name].grad.numpy().copy() for name in self._added if a[name] is not None}
+        weight = np.sqrt(self._vector("inverse_x", "inverse_s"))
+        first = float(np.linalg.norm(weight * rho))
+        basis, parts, columns = [], [], []
+        combination, size = np.zeros(0), first
+        while size > max(self.model.tolerance, 10.0 * self._rounding) * first:
+            if len(parts) == MOST_PARTS or not np.isfinite(size) or a["status"].numpy()[0]:
+                self._stall(size / first)
+                return
+            if not basis:
+                basis.append(weight * rho / first)
+            self._set_vector("seed", basis[-1] / np.where(weight > 0.0, weight, 1.0))
+            self._run(self._solve_part)
+            parts.append(self._vector("rhs", gradient=True))
+            self._run(self._product)
+            image = -weight * self._vector("seed")
+            # modified Gram-Schmidt, twice: once loses what GMRES needs of orthogonality near the end
+            column = np.zeros(len(basis))
+            for _ in range(2):
+                for k, vector in enumerate(basis):
+                    share = float(vector @ image)
+                    column[k] += share
+                    image -= share * vector
+            norm = float(np.linalg.norm(image))
+            columns.append(np.append(column, norm))
+            hessenberg = np.zeros((len(columns) + 1, len(columns)))
+            for k, entries in enumerate(columns):
+                hessenberg[: len(entries), k] = entries
+            target = np.zeros(len(columns) + 1)
+            target[0] = first
+            combination = np.linalg.lstsq(hessenberg, target, rcond=None)[0]
+            size = float(np.linalg.norm(hessenberg @ combination - target))
+            if norm == 0.0:
+                break
+            basis.append(image / norm)
+        for name, values in kept.items():
+            a[name].grad.assign(values)
+        total = sum((c * part for c, part in zip(combination, parts, strict=True)), np.zeros_like(rho))
+        self._set_vector("rhs", total, gradient=True)
+        self._run(self._reverse)
+        self._run(self._gather)
+        self._run(self._absorb)
+
+    def _vector(self, *names: str, gradient: bool = False) -> np.ndarray:
+        """An array of the positions and its companion of (u, v), as one vector; named by the first, or by both."""
+        total = []
+        for name in names if len(names) == 2 else (names[0], f"euler_{names[0]}"):
+            array = self.model.arrays[name]
+            if array is not None:
+                total.append((array.grad if gradient else array).numpy().astype(np.float64).ravel())
+        return np.concatenate(total)
+
+    def _set_vector(self, name: str, values: np.ndarray, *, gradient: bool = False) -> None:
+        at = 0
+        for part in (name, f"euler_{name}"):
+            array = self.model.arrays[part]
+            if array is not None:
+                target = array.grad if gradient else array
+                count = target.numpy().size
+                target.assign(values[at : at + count].reshape(target.numpy().shape))
+                at += count
+
+    @property
+    def _added(self) -> tuple[str, ...]:
+        """Arrays whose gradients reverse mode adds to: the stage's own, friction's anchors and the parameters."""
+        between = {*BETWEEN, "rhs", "euler_rhs"}
+        arrays = (array for launch in self.tape.launches for array in launch[3] if isinstance(array, wp.array))
+        pointers = {array.ptr for array in arrays if array.grad is not None}
+        a = self.model.arrays
+        return tuple(
+            name
+            for name, array in a.items()
+            if isinstance(array, wp.array) and array.grad is not None and array.ptr in pointers and name not in between
+        )
+
+    def _gather(self) -> None:
+        """ρ = w̄ + (∂r/∂w)ᵀ λ, of what reverse mode has gathered."""
+        self.model.launch("stage_adjoint_residual", "nodes")
+
+    def _solve_part(self) -> None:
+        a = self.model.arrays
+        a.zero_grad("rhs", "euler_rhs")
+        part = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
+        self.model.solve(tolerance=INNER_TOLERANCE, rhs=a["seed"], euler_rhs=a["euler_seed"], **part)
+
+    def _product(self) -> None:
+        """(∂r/∂w)ᵀ of the part in the gradient of the right-hand side."""
+        a = self.model.arrays
+        a.zero_grad(*MOVED)
+        self._reverse()
+        zero = {"stage_adjoint": a["zero"], "euler_stage_adjoint": a["euler_zero"]}
+        self.model.launch("stage_adjoint_residual", "nodes", **zero)
+
+    def _reverse(self) -> None:
+        self.model.arrays.zero_grad(*BETWEEN)
+        self.tape.backward()
+
+    def _absorb(self) -> None:
+        model, a = self.model, self.model.arrays
+        if model.held:
+            # what is held has no λ: its row of ρ is the adjoint of the velocity that holds it
+            a["q_x"].zero_()
+            model.launch("held_adjoint", "pins")
+        model.launch("absorb_stage", "nodes")
+
+    def _finish(self) -> None:
+        a = self.model.arrays
+        if self.model.held:
+            self.held_tape.backward()
+        for name in ("position", "euler", "velocity", "euler_velocity"):
+            if a[name] is not None:
+                wp.copy(a[name].grad, a[f"base_{name}"].grad)
+        _, after = self._around
+        after()
