@@ -11,7 +11,7 @@ process grew by, from a run of few steps to one of many, where the system tells.
 
 Forward only: Simulator.run, in a process that never made anything of gradients; in one that computed gradients of
 another run; and by the simulator of that run; in turn. Compiling, once a machine: the first step with an empty kernel
-cache, with the reverse of every kernel, as it is by default, and without (wp.config.enable_backward = False).
+cache, of a simulator with reverse mode and of one without.
 
 Error: the relative error of gradients, against those at a solver tolerance of 1e-14, and of the positions, for each
 tolerance, on a hung 6 × 6 twill. The tolerance is that of the adjoint solves too.
@@ -224,10 +224,10 @@ FIRST_STEP = """
 import sys, time
 import warp as wp
 wp.config.log_level = wp.LOG_WARNING
-wp.config.kernel_cache_dir, wp.config.enable_backward = sys.argv[1], sys.argv[2] == "with"
+wp.config.kernel_cache_dir = sys.argv[1]
 import warp_yarn as wy
 begin = time.process_time()
-wy.Simulator(wy.paper.hung_cloth(rows=5, columns=5)).run(1)
+wy.Simulator(wy.paper.hung_cloth(rows=5, columns=5), differentiable=sys.argv[2] == "with").run(1)
 print(time.process_time() - begin)
 """
 """A script whose arguments are a cache's folder, and "with" or "without"."""

@@ -56,9 +56,10 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
     for term in TERMS.values():
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
-            kernels[f"{term.name}_energy"] = term.energy(variant)
+            kernels[f"{term.name}_energy"] = term.energy(variant.forward)
         if term.contact_load is not None:
             kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
+    kernels |= vars(step.define_reversible(variant))
     for part in (step, solver, history, adjoint, stage):
-        kernels |= vars(part.define(variant))
+        kernels |= vars(part.define(variant.forward))
     return kernels

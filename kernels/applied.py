@@ -11,7 +11,7 @@ from .variant import Term, Variant
 def define(variant: Variant) -> wp.Kernel:
     vec3 = variant.vec3
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def applied_term(
         applied_node: wp.array(dtype=int),
         applied_force: wp.array(dtype=vec3),

@@ -81,7 +81,7 @@ def define(variant: Variant) -> wp.Kernel:
             return angle_over_sine * angle_over_sine * series
         return (scalar(1.0) - kappa) / wp.max(z, scalar(1.0e-12))
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def bending_term(
         # topology
         bend_nodes: wp.array(dtype=wp.vec3i),
@@ -181,7 +181,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     bend_angle, bend_stiffness = functions(variant).angle, functions(variant).stiffness
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def bending_energy(
         bend_nodes: wp.array(dtype=wp.vec3i),
         bend_yarn: wp.array(dtype=int),
@@ -210,7 +210,7 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
     f = functions(variant)
     bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def bending_contact_load(
         bend_nodes: wp.array(dtype=wp.vec3i),
         bend_yarn: wp.array(dtype=int),

@@ -90,7 +90,7 @@ def define_normal(variant: Variant) -> wp.Kernel:
     plane_normal = functions(variant).plane_normal
 
     # a module of its own: drawing a recording needs this kernel alone, and not the minute that all terms compile
-    @wp.kernel(module=variant.module("contact"))
+    @variant.kernel("contact")
     def contact_normal(
         crossing_node: wp.array(dtype=int),
         crossing_neighbours: wp.array(dtype=wp.vec4i),

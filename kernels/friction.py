@@ -66,7 +66,7 @@ def define(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     friction_force = functions(variant).force
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def friction_term(
         # topology
         crossing_node: wp.array(dtype=int),
@@ -117,7 +117,7 @@ def define(variant: Variant) -> wp.Kernel:
 def define_anchor(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def drag_anchor(
         crossing_node: wp.array(dtype=int),
         friction: wp.array(dtype=scalar),

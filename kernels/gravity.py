@@ -16,7 +16,7 @@ from .variant import Term, Variant
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def gravity_term(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),
@@ -49,7 +49,7 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def gravity_energy(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),

@@ -19,7 +19,7 @@ from .variant import Term, Variant
 def define_mass(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def mass_term(
         # topology
         segment_nodes: wp.array(dtype=wp.vec2i),
@@ -95,7 +95,7 @@ def define_mass(variant: Variant) -> wp.Kernel:
 def define_inertia(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def inertia_term(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),
@@ -135,7 +135,7 @@ def define_inertia(variant: Variant) -> wp.Kernel:
 def define_mass_rate(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def mass_rate_term(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),
@@ -181,7 +181,7 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def kinetic_energy(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),

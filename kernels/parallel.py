@@ -13,7 +13,7 @@ from .variant import Term, Variant
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def parallel_term(
         # topology
         segment_nodes: wp.array(dtype=wp.vec2i),
@@ -60,7 +60,7 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def parallel_energy(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),

@@ -14,7 +14,7 @@ from .variant import Term, Variant
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def pin_term(
         pin_node: wp.array(dtype=int),
         pin_stiffness: wp.array(dtype=scalar),
@@ -37,7 +37,7 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def pin_energy(
         pin_node: wp.array(dtype=int),
         pin_stiffness: wp.array(dtype=scalar),

@@ -68,7 +68,7 @@ def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
     shear_lock, shear_angle = functions(variant).lock, functions(variant).angle
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def shear_term(
         # topology
         corner_nodes: wp.array(dtype=wp.vec3i),
@@ -142,7 +142,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     shear_lock, shear_angle = functions(variant).lock, functions(variant).angle
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def shear_energy(
         corner_nodes: wp.array(dtype=wp.vec3i),
         corner_jams: wp.array(dtype=int),

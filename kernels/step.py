@@ -17,11 +17,11 @@ NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED = 1, 2, 3, 4
 
 
 @functools.cache
-def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
-    module = variant.module("step")
+def define_reversible(variant: Variant) -> SimpleNamespace:
+    """What the adjoint runs in reverse."""
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
 
-    @wp.kernel(module=module)
+    @variant.kernel("terms")
     def right_hand_side(
         step_size: wp.array(dtype=scalar),
         force: wp.array(dtype=vec3),
@@ -41,6 +41,27 @@ def define(variant: Variant) -> SimpleNamespace:
                 if friction_force_out:
                     f += friction_force_out[s]
                 euler_rhs[s] = f * step_size[0] + euler_momentum[s]
+
+    @variant.kernel("terms")
+    def prescribe(
+        pin_node: wp.array(dtype=int),
+        pin_target: wp.array(dtype=vec3),
+        step_size: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        solution: wp.array(dtype=vec3),
+    ):
+        """The velocity that brings an exact pin to its target within the step."""
+        e = wp.tid()
+        i = pin_node[e]
+        solution[i] = (pin_target[e] - position[i]) / step_size[0]
+
+    return SimpleNamespace(right_hand_side=right_hand_side, prescribe=prescribe)
+
+
+@functools.cache
+def define(variant: Variant) -> SimpleNamespace:
+    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    module = variant.module("step")
 
     @wp.kernel(module=module, enable_backward=False)
     def precondition(
@@ -66,19 +87,6 @@ def define(variant: Variant) -> SimpleNamespace:
                     inverse_s[s] = one / diagonal_ss[s]
                 else:
                     inverse_s[s] = scalar(0.0)
-
-    @wp.kernel(module=module)
-    def prescribe(
-        pin_node: wp.array(dtype=int),
-        pin_target: wp.array(dtype=vec3),
-        step_size: wp.array(dtype=scalar),
-        position: wp.array(dtype=vec3),
-        solution: wp.array(dtype=vec3),
-    ):
-        """The velocity that brings an exact pin to its target within the step."""
-        e = wp.tid()
-        i = pin_node[e]
-        solution[i] = (pin_target[e] - position[i]) / step_size[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
@@ -126,9 +134,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 status[1] = a
 
     return SimpleNamespace(
-        right_hand_side=right_hand_side,
         precondition=precondition,
-        prescribe=prescribe,
         advance=advance,
         check_order=check_order,
     )

@@ -39,7 +39,7 @@ def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def stretch_term(
         # topology
         segment_nodes: wp.array(dtype=wp.vec2i),
@@ -111,7 +111,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     stretch_stiffness = functions(variant).stiffness
 
-    @wp.kernel(module=variant.module("energy"))
+    @variant.kernel("energy")
     def stretch_energy(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),
@@ -138,7 +138,7 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def stretch_contact_load(
         segment_nodes: wp.array(dtype=wp.vec2i),
         segment_yarn: wp.array(dtype=int),

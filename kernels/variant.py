@@ -8,14 +8,21 @@ import warp as wp
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One compilation of every kernel: the scalar type, and whether yarns slide.
+    """One compilation of every kernel: the scalar type, whether yarns slide, and whether reverse mode is compiled too.
 
-    Without sliding the branches under ``if wp.static(sliding)`` are not generated, so a scene that locks the
-    Eulerian coordinates pays neither for their arithmetic nor for their arrays (which are passed as ``None``).
+    Without sliding the branches under ``if wp.static(sliding)`` are not generated, so a scene that locks the Eulerian
+    coordinates pays neither for their arithmetic nor for their arrays (which are passed as ``None``). Reverse mode
+    takes as long to compile as all the rest, which a user of the forward simulation need not wait for.
     """
 
     scalar: type
     sliding: bool
+    reverse: bool = False
+
+    @property
+    def forward(self) -> "Variant":
+        """The variant without reverse mode, of kernels that never need it."""
+        return dataclasses.replace(self, reverse=False)
 
     @property
     def vec3(self) -> type:
@@ -30,7 +37,12 @@ class Variant:
 
         One module a variant: typing.Any kernels would rebuild their module at every new instantiation.
         """
-        return f"warp_yarn_{name}_{self.scalar.__name__}_{'sliding' if self.sliding else 'locked'}"
+        parts = ["warp_yarn", name, self.scalar.__name__, "sliding" if self.sliding else "locked"]
+        return "_".join(parts + ["reverse"] * self.reverse)
+
+    def kernel(self, module: str) -> Callable[[Callable], wp.Kernel]:
+        """Decorator of a kernel of this variant in one of its modules."""
+        return wp.kernel(module=self.module(module), enable_backward=self.reverse)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ from .variant import Term, Variant
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
 
-    @wp.kernel(module=variant.module("terms"))
+    @variant.kernel("terms")
     def wind_term(
         # topology
         triangle_nodes: wp.array(dtype=wp.vec3i),

@@ -102,13 +102,16 @@ def command(main: Callable[[Sequence[str] | None], Any], arguments: Sequence[str
     """Runs a scene's main and says on stderr what went wrong.
 
     Returns:
-        Exit code: 0; 1 a simulation failed; 2 wrong arguments or files; 130 Ctrl-C.
+        Exit code: 0; 1 a simulation failed, or its gradient; 2 wrong arguments or files; 130 Ctrl-C.
     """
     wp.config.log_level = wp.LOG_WARNING
     try:
         main(arguments)
     except wy.SimulationError as error:
         print(f"The simulation failed in {error}", file=sys.stderr)
+        return 1
+    except wy.GradientError as error:
+        print(f"There is no gradient: {error}", file=sys.stderr)
         return 1
     except (wy.InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

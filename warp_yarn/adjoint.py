@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from .arrays import STATE_TYPES
-from .errors import GradientError
+from .errors import GradientError, InputError
 from .kernels.step import NOT_FINITE
 from .model import PATHS
 from .simulator import Simulator
@@ -30,6 +30,8 @@ class Adjoint:
     """
 
     def __init__(self, simulator: Simulator, parameters: tuple[str, ...]):
+        if not simulator.arrays.variant.reverse:
+            raise InputError("simulator has no reverse mode, must be made with differentiable=True")
         self.simulator, self.parameters = simulator, parameters
         a = self.arrays = simulator.arrays
         self.moving = [name for name in PATHS if name in parameters and f"{name}_path" in a]
@@ -90,7 +92,9 @@ class Adjoint:
         code, node = (int(value) for value in a["status"].numpy()[:2])
         a.zero("status")
         columns = self.simulator.scene.cloth.weave.columns
-        where = f"step {k}, at node {node} (row {node // columns}, column {node % columns})"
+        where = f"step {k}"
+        if node >= 0:
+            where += f", at node {node} (row {node // columns}, column {node % columns})"
         term = None
         if code == NOT_FINITE:
             message = f"the adjoint of {where} is not finite"

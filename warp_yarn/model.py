@@ -31,8 +31,8 @@ class Model:
     """A scene on the device.
 
     Args:
-        scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations: as of the
-            Simulator.
+        scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations,
+            differentiable: as of the Simulator.
 
     Attributes:
         arrays: by the names that kernels use.
@@ -51,6 +51,7 @@ class Model:
         tolerance: float | None,
         newton_tolerance: float | None,
         max_iterations: int | None,
+        differentiable: bool,
     ):
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {scene!r}, must be a Scene")
@@ -70,7 +71,7 @@ class Model:
         except Exception as error:
             names = ", ".join(str(d) for d in wp.get_devices())
             raise InputError(f"device = {device!r}, must be one of {names}") from error
-        variant = Variant(PRECISIONS[precision], scene.sliding)
+        variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
         self.arrays = Arrays(scene, variant, self.device)
         self.arrays["step_size"].assign(np.array([self.step_size]))

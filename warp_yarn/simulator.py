@@ -37,6 +37,7 @@ class Simulator:
             single precision 1e-4.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
         chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
+        differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
 
     Attributes:
         state: the present state; set it to start from another one.
@@ -57,6 +58,7 @@ class Simulator:
         newton_tolerance: float | None = None,
         max_iterations: int | None = None,
         chunk: int | None = None,
+        differentiable: bool = False,
     ):
         method = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
         self.model = Model(
@@ -68,6 +70,7 @@ class Simulator:
             tolerance=tolerance,
             newton_tolerance=newton_tolerance,
             max_iterations=max_iterations,
+            differentiable=differentiable,
         )
         self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
         self.integrator = method(self.model)

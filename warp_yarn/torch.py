@@ -78,7 +78,7 @@ class Rollout:
         if len(self.frames) == 0 or self.frames[0] < 0 or self.frames[-1] > steps or (np.diff(self.frames) <= 0).any():
             raise InputError(f"frames = {frames}, must increase from 0 at least to {steps} at most")
         chunk = None if checkpoint_every == 1 else checkpoint_every
-        self.simulator = Simulator(scene, chunk=chunk, **options)
+        self.simulator = Simulator(scene, chunk=chunk, differentiable=True, **options)
         self.dtype = {"double": torch.float64, "single": torch.float32}[self.simulator.model.precision]
         self.device = wp.device_to_torch(self.simulator.model.device)
         self.defaults = self._defaults()
