@@ -210,6 +210,7 @@ def test_a_machine_without_opengl_gets_an_error_and_no_crash(tmp_path, monkeypat
     assert os.listdir(tmp_path) == []
 
 
-def test_nothing_of_it_is_imported_before_it_is_needed():
+def test_nothing_of_it_is_imported_before_it_is_needed(tmp_path):
     code = "import sys, warp_yarn; sys.exit(any(m in sys.modules for m in ('pyvista', 'vtkmodules', 'imageio')))"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
