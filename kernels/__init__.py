@@ -15,6 +15,7 @@ from . import (
     friction,
     gravity,
     history,
+    incomplete,
     inertia,
     parallel,
     pins,
@@ -60,6 +61,6 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
         if term.contact_load is not None:
             kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
     kernels |= vars(step.define_reversible(variant))
-    for part in (step, solver, history, adjoint, stage):
+    for part in (step, solver, incomplete, history, adjoint, stage):
         kernels |= vars(part.define(variant.forward))
     return kernels

@@ -99,6 +99,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
+        """q⁺ = q + h q̇⁺, and whether it is finite."""
         i = wp.tid()
         h = step_size[0]
         v = solution[i]
@@ -126,6 +127,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
+        """Δs > 0: crossings keep their order along a yarn."""
         e = wp.tid()
         a = segment_nodes[e][0]
         direction = yarn_direction[segment_yarn[e]]

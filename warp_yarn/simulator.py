@@ -30,7 +30,8 @@ class Simulator:
             step) or "sdirk2" (order 2, two implicit stages); see ``warp_yarn/integrators``.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
-        preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (see ``kernels/solver.py``).
+        preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (``kernels/incomplete.py``,
+            ``kernels/solver.py``).
         tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-8, in
             single precision 1e-4. Within an implicit stage it is that of the adjoint's solves alone.
         newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms; None: 1e-6, in
