@@ -1,6 +1,8 @@
 """Gradients of whole runs against central differences, for every input that a run takes."""
 
 import itertools
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -264,6 +266,14 @@ def test_two_runs_in_one_loss() -> None:
         separate.append(gradient)
     both = sum((rollout(shear=value).position[-1] * 1e3).pow(2).sum() for value in values)
     assert torch.equal(torch.stack(torch.autograd.grad(both, values)), torch.stack(separate))
+
+
+def test_torch_is_imported_when_asked_for(tmp_path) -> None:
+    code = "import sys, warp_yarn as wy; assert 'torch' not in sys.modules; wy.torch.Rollout"
+    # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path).returncode == 0
+    with pytest.raises(AttributeError, match="no attribute 'jax'"):
+        wy.jax  # noqa: B018
 
 
 def test_a_forward_user_has_no_gradient_arrays() -> None:

@@ -1,5 +1,8 @@
 """Differentiable simulation of woven fabric, yarn by yarn."""
 
+import importlib
+from types import ModuleType
+
 from . import paper
 from .cloth import Cloth, Yarn
 from .errors import GradientError, InputError, SimulationError, WarpYarnError
@@ -32,3 +35,13 @@ __all__ = [
     "write_png",
     "write_usd",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """``warp_yarn.torch``, imported when it is asked for."""
+    if name != "torch":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        return importlib.import_module(".torch", __name__)
+    except ModuleNotFoundError as error:
+        raise InputError("gradients need torch: pip install warp_yarn[torch]") from error
