@@ -3,9 +3,9 @@
     python benchmarks/integrators.py [--size 5] [--repeats 7]
 
 The error is the root mean square over the nodes of the distance of their positions after 25 ms to converged ones, over
-that of their displacement. Converged: the second-order method at a 64th and a 128th of a millisecond, extrapolated; the
-table's last row is how far eq. 2, extrapolated from the same steps, is from that. The time is that of the 25 ms, kernels
-compiled and graphs captured before.
+that of their displacement. Converged: the second-order method at a 64th and a 128th of a millisecond, extrapolated;
+the table's last row is how far eq. 2, extrapolated from the same steps, is from that. The time is that of the 25 ms,
+kernels compiled and graphs captured before.
 """
 
 from __future__ import annotations
