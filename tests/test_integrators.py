@@ -136,6 +136,21 @@ def test_directional_derivatives(method: str, group: str) -> None:
         assert found == pytest.approx(expected, rel=1e-5, abs=1e-6), name
 
 
+@pytest.mark.parametrize("method", INTEGRATORS)
+@pytest.mark.parametrize("terms", [["inertia"], []], ids=["inertia", "mass alone"])
+def test_crossings_never_change_their_order(method: str, terms: list[str]) -> None:
+    """Two crossings of a yarn that fly at each other with nothing to keep them apart end the run in time."""
+    fabric = cloth(4, 4)
+    rates = np.zeros((fabric.nodes, 2))
+    rates[5, 0], rates[6, 0] = 0.2, -0.2
+    simulator = wy.Simulator(wy.Scene(fabric, gravity=None, terms=terms), integrator=method)
+    simulator.state = wy.State(fabric.position, fabric.euler, np.zeros((fabric.nodes, 3)), rates)
+    with pytest.raises(wy.SimulationError) as error:
+        simulator.run(20)
+    euler = error.value.trajectory.euler.reshape(-1, 4, 4, 2)
+    assert np.diff(euler[..., 0], axis=2).min() > 0.0 and np.diff(euler[..., 1], axis=1).min() > 0.0
+
+
 def test_unknown_method_is_refused() -> None:
     with pytest.raises(wy.InputError, match=r"integrator = 'leapfrog', must be one of linear, implicit-euler, sdirk2"):
         wy.Simulator(scene_for("plain", 1), integrator="leapfrog")

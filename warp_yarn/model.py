@@ -19,6 +19,8 @@ MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
 )  # fmt: skip
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
+BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
+"""Arrays that an assembly passes through, whose adjoints start at 0."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
 PRECONDITIONERS = ("incomplete", "jacobi")
@@ -134,6 +136,22 @@ class Model:
         a = self.arrays
         if a["anchor"] is not None:
             self.launch("drag_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
+
+    def end_step(self) -> None:
+        """What every method ends a step with, its end state in place: checks and moves on, and records the frame."""
+        if self.scene.sliding:
+            self.launch("check_order", "segments")
+        self.drag_anchor("euler", "anchor")
+        self.launch("count", 1, by=1)
+        self.launch("record", "nodes")
+
+    def add_adjoint_arrays(self) -> None:
+        """Room for the right-hand side of the adjoint solve, and for (u, v) and the anchors at the end of a step."""
+        a, n = self.arrays, self.arrays["nodes"]
+        a["seed"] = a.zeros(n, a.variant.vec3)
+        for name in ("euler_seed", "euler_next"):
+            a[name] = a.zeros(2 * n, a.variant.scalar) if self.scene.sliding else None
+        a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, a.variant.scalar)
 
     def take_inputs(self) -> None:
         """Puts this step's pins and applied forces in place, where they change."""

@@ -238,7 +238,7 @@ class Rollout:
             if every == 1:
                 self._restore(kept, first, steps + 1)
             else:
-                self._restart(values, kept, first)
+                self._restart(kept, first)
                 simulator.run_chunk(steps)
             self._set_losses(losses, first, steps)
             adjoint.backward_chunk(first, steps)
@@ -257,7 +257,8 @@ class Rollout:
             frames = _flat(self.simulator.arrays[f"frame_{name}"]).view(-1, *source.shape[1:])
             frames[:count].copy_(source[first : first + count])
 
-    def _restart(self, values: Mapping[str, torch.Tensor], kept: Mapping[str, torch.Tensor], first: int) -> None:
+    def _restart(self, kept: Mapping[str, torch.Tensor], first: int) -> None:
+        """Puts the state that a chunk starts from back."""
         for name, source in kept.items():
             _flat(self.simulator.arrays[name]).copy_(source[first // self.checkpoint_every].reshape(-1))
         self.simulator.steps_done = first

@@ -7,10 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from ..model import MATRIX, SUMS, Model
-
-BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
-"""Arrays within a step whose adjoints start at 0."""
+from ..model import BETWEEN, MATRIX, Model
 
 
 class LinearlyImplicitEuler:
@@ -47,11 +44,7 @@ class LinearlyImplicitEuler:
         model.prescribe()
         model.solve()
         model.launch("advance", "nodes")
-        if model.scene.sliding:
-            model.launch("check_order", "segments")
-        model.drag_anchor("euler", "anchor")
-        model.launch("count", 1, by=1)
-        model.launch("record", "nodes")
+        model.end_step()
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -63,11 +56,7 @@ class LinearlyImplicitEuler:
         """
         model, a = self.model, self.model.arrays
         if "seed" not in a:
-            vec3, scalar, n = a.variant.vec3, a.variant.scalar, a["nodes"]
-            a["seed"] = a.zeros(n, vec3)
-            sliding = {"euler_seed": 2 * n, "euler_next": 2 * n}
-            a |= {name: a.zeros(count, scalar) if model.scene.sliding else None for name, count in sliding.items()}
-            a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, scalar)
+            model.add_adjoint_arrays()
         a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if model.scene.sliding:
             # s⁺ is the end of the step for friction's anchor too: one running adjoint

@@ -9,15 +9,13 @@ import numpy as np
 import warp as wp
 
 from ..kernels.step import STALLED
-from ..model import SUMS, Model
+from ..model import BETWEEN, Model
 
-BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
-"""Arrays within an evaluation of the residual whose adjoints start at 0."""
 MOVED = ("position", "euler", "velocity", "euler_velocity", "increment", "euler_increment")
 """Arrays of the stage that w moves."""
 
-FORWARD = ("_begin", "_evaluate", "_solve_direction", "_correct", "_next_base", "_end")
-
+FORWARD = ("_begin", "_evaluate", "_solve_direction", "_correct", "_next_base", "end_step")
+"""Parts of a step whose graphs hold nothing of adjoints."""
 INNER_TOLERANCE = 1e-3
 """Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
 would not come nearer to the stage's."""
@@ -100,7 +98,7 @@ class StageMethod:
             if stage:
                 self._run(self._next_base)
             self._newton()
-        self._run(self._end)
+        self._run(self.model.end_step)
 
     def _next_base(self) -> None:
         self.model.launch("next_base", "nodes")
@@ -190,12 +188,6 @@ class StageMethod:
         a["residual"].fill_(float(residual))
         a["status"].assign(np.array([STALLED, -1, 0], dtype=np.int32))
 
-    def _end(self) -> None:
-        model = self.model
-        model.drag_anchor("euler", "anchor")
-        model.launch("count", 1, by=1)
-        model.launch("record", "nodes")
-
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[], None]) -> None:
@@ -203,13 +195,10 @@ class StageMethod:
         model, a = self.model, self.model.arrays
         vec3, scalar, n, sliding = a.variant.vec3, a.variant.scalar, a["nodes"], model.scene.sliding
         if "seed" not in a:
-            for name in ("seed", "stage_adjoint", "zero"):
+            model.add_adjoint_arrays()
+            for name in ("stage_adjoint", "zero", "first_solution"):
                 a[name] = a.zeros(n, vec3)
                 a[f"euler_{name}"] = a.zeros(2 * n, scalar) if sliding else None
-            a["euler_next"] = a.zeros(2 * n, scalar) if sliding else None
-            a["first_solution"] = a.zeros(n, vec3)
-            a["euler_first_solution"] = a.zeros(2 * n, scalar) if sliding else None
-            a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, scalar)
         base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
         a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if sliding:
@@ -222,6 +211,7 @@ class StageMethod:
         with self.held_tape:
             model.prescribe(position=a["base_position"])
         self._around = before, after
+        self._added = self._arrays_added_to()
         self._graphs = {name: graph for name, graph in self._graphs.items() if name in FORWARD}
 
     def retreat(self) -> None:
@@ -287,7 +277,7 @@ class StageMethod:
         self._run(self._gather)
         rho = self._vector("seed")
         # Products with the derivative run all of reverse mode: what it adds to is put back, and added to at the end.
-        kept = {name: a[name].grad.numpy().copy() for name in self._added if a[name] is not None}
+        kept = {name: a[name].grad.numpy().copy() for name in self._added}
         weight = np.sqrt(self._vector("inverse_x", "inverse_s"))
         first = float(np.linalg.norm(weight * rho))
         basis, parts, columns = [], [], []
@@ -349,8 +339,7 @@ class StageMethod:
                 target.assign(values[at : at + count].reshape(target.numpy().shape))
                 at += count
 
-    @property
-    def _added(self) -> tuple[str, ...]:
+    def _arrays_added_to(self) -> tuple[str, ...]:
         """Arrays whose gradients reverse mode adds to: the stage's own, friction's anchors and the parameters."""
         between = {*BETWEEN, "rhs", "euler_rhs"}
         arrays = (array for launch in self.tape.launches for array in launch[3] if isinstance(array, wp.array))
