@@ -3,7 +3,9 @@
     V = k_b θ²/Δs,   k_b = B π R²,   Δs = s_b − s_a
     θ: the angle between t₁ and −t₂, with t₁ = dir(x_b − x_c) and t₂ = dir(x_a − x_c); 0 where the yarn is straight
 
-Parameters: ``bend`` B, bending modulus of each yarn [Pa m²] (the paper prints N/m); ``radius`` R [m].
+and between this and the k_b π²/Δs of a flat fold where a segment has shrunk to nearly a point (``vanishing.py``).
+
+Parameters: ``bend`` B, bending modulus of each yarn [Pa m²] (the paper prints N/m); ``radius`` R and ``spacing`` L [m].
 
 θ² and θ/sin θ are taken from sin²θ by their series near 0: the state of rest is straight, and an acos near ±1 or a
 division by sin θ gives noise there, and NaN adjoints.
@@ -11,16 +13,20 @@ division by sin θ gives noise there, and NaN adjoints.
 The matrix is the Gauss-Newton part (2k_b/Δs)(dθ − θ dΔs/Δs)², and, across the plane of the yarn, the positive
 eigenvalue of the exact second derivative, κ = (θ/2)/tan(θ/2) times the same stiffness. Written with the rotation Q that
 takes −t₂ to t₁, both are smooth at θ = 0, where the plane is undefined. Left out are the terms in 1/l², which are
-indefinite and vanish with θ.
+indefinite and vanish with θ. Of a shrinking segment it has the positive part of the curvature along it.
 """
 
 import functools
+import math
 from types import SimpleNamespace
 
 import warp as wp
 
+from . import vanishing
 from .variant import Term, Variant
 
+FLAT = math.pi**2
+"""θ² of a flat fold."""
 SERIES_BELOW = 1.0e-3
 """sin²θ under which the series are used: their first dropped term is then under 1e-16."""
 
@@ -53,9 +59,20 @@ def functions(variant: Variant) -> SimpleNamespace:
         return vec2(angle * angle, angle / wp.max(sine, scalar(1.0e-9)))
 
     @wp.func
-    def bend_force(t1: vec3, t2: vec3, l1: scalar, k: scalar, angle_over_sine: scalar) -> vec3:
-        """Force on the end that t1 points to; k = 2k_b/Δs."""
-        return (t2 - t1 * wp.dot(t1, t2)) * (-k * angle_over_sine / l1)
+    def bend_force(
+        t1: vec3,
+        t2: vec3,
+        by_length: scalar,
+        mine: vec3,
+        other: vec3,
+        k: scalar,
+        square: scalar,
+        angle_over_sine: scalar,
+    ) -> vec3:
+        """Force on the end that t1 points to; k = 2k_b/Δs, mine and other (s, s', s'') of the two segments."""
+        turning = (t2 - t1 * wp.dot(t1, t2)) * (angle_over_sine * mine[0] * by_length)
+        along = t1 * (scalar(0.5) * (square - scalar(wp.static(FLAT))) * mine[1])
+        return (turning + along) * (-k * other[0])
 
     @wp.func
     def bend_stiffness(modulus: scalar, radius: scalar) -> scalar:
@@ -69,6 +86,7 @@ def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     f = functions(variant)
     bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
+    presence, inverse_length = vanishing.functions(variant).presence, vanishing.functions(variant).inverse_length
 
     @wp.func
     def in_plane_excess(z: scalar, cosine: scalar, square: scalar, kappa: scalar, angle_over_sine: scalar) -> scalar:
@@ -91,6 +109,7 @@ def define(variant: Variant) -> wp.Kernel:
         # parameters
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
         # state in
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -118,8 +137,10 @@ def define(variant: Variant) -> wp.Kernel:
         rest = euler[sb] - euler[sa]
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
-        l1 = wp.length(e1)
-        l2 = wp.length(e2)
+        s1 = presence(wp.length(e1), spacing[0])
+        s2 = presence(wp.length(e2), spacing[0])
+        by_l1 = inverse_length(wp.length(e1), spacing[0])
+        by_l2 = inverse_length(wp.length(e2), spacing[0])
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
         k = scalar(2.0) * bend_stiffness(bend[bend_yarn[e]], radius[0]) / rest
@@ -127,18 +148,21 @@ def define(variant: Variant) -> wp.Kernel:
         square = angle[0]
         angle_over_sine = angle[1]
 
-        f_b = bend_force(t1, t2, l1, k, angle_over_sine)
-        f_a = bend_force(t2, t1, l2, k, angle_over_sine)
+        f_b = bend_force(t1, t2, by_l1, s1, s2, k, square, angle_over_sine)
+        f_a = bend_force(t2, t1, by_l2, s2, s1, k, square, angle_over_sine)
         wp.atomic_add(force, b, f_b)
         wp.atomic_add(force, a, f_a)
         wp.atomic_add(force, c, -(f_a + f_b))
         if wp.static(sliding):
-            f_s = scalar(0.5) * k * square / rest
+            s12 = s1[0] * s2[0]
+            faded = square * s12 + scalar(wp.static(FLAT)) * (scalar(1.0) - s12)
+            f_s = scalar(0.5) * k * faded / rest
             wp.atomic_add(euler_force, sb, f_s)
             wp.atomic_add(euler_force, sa, -f_s)
 
         if matrix != 0:
-            stiffness = weights[0][2] * k
+            bare = weights[0][2] * k
+            stiffness = bare * s1[0] * s2[0]
             cosine = -wp.dot(t1, t2)
             w = wp.cross(t1, t2)
             q1 = t2 + t1 * cosine
@@ -148,10 +172,15 @@ def define(variant: Variant) -> wp.Kernel:
             eye = wp.identity(n=3, dtype=scalar)
             turn = wp.skew(w)
             rotation = kappa * (eye + turn + wp.outer(t1, t2)) + scalar(0.5) * angle_over_sine * (turn * turn)
-            bb = (kappa * (eye - wp.outer(t1, t1)) + chi * wp.outer(q1, q1)) * (stiffness / (l1 * l1))
-            aa = (kappa * (eye - wp.outer(t2, t2)) + chi * wp.outer(q2, q2)) * (stiffness / (l2 * l2))
-            ba = (rotation + chi * wp.outer(q1, q2)) * (stiffness / (l1 * l2))
+            bb = (kappa * (eye - wp.outer(t1, t1)) + chi * wp.outer(q1, q1)) * (stiffness * by_l1 * by_l1)
+            aa = (kappa * (eye - wp.outer(t2, t2)) + chi * wp.outer(q2, q2)) * (stiffness * by_l2 * by_l2)
+            ba = (rotation + chi * wp.outer(q1, q2)) * (stiffness * by_l1 * by_l2)
             ab = wp.transpose(ba)
+            gain = scalar(0.5) * bare * (square - scalar(wp.static(FLAT)))
+            if s1[2] < scalar(0.0):
+                bb += wp.outer(t1, t1) * (gain * s1[2] * s2[0])
+            if s2[2] < scalar(0.0):
+                aa += wp.outer(t2, t2) * (gain * s2[2] * s1[0])
             wp.atomic_add(diagonal_xx, a, aa)
             wp.atomic_add(diagonal_xx, b, bb)
             wp.atomic_add(diagonal_xx, c, aa + bb + ab + ba)
@@ -160,10 +189,10 @@ def define(variant: Variant) -> wp.Kernel:
             wp.atomic_add(upper_xx, stencil * a + 2 + direction, ab)
             if wp.static(sliding):
                 # θ dθ = (θ/sin θ) q·dx / l
-                xs_b = q1 * (stiffness * angle_over_sine / (l1 * rest))
-                xs_a = q2 * (stiffness * angle_over_sine / (l2 * rest))
+                xs_b = q1 * (stiffness * angle_over_sine * by_l1 / rest)
+                xs_a = q2 * (stiffness * angle_over_sine * by_l2 / rest)
                 xs_c = -(xs_a + xs_b)
-                ss = stiffness * square / (rest * rest)
+                ss = bare * faded / (rest * rest)
                 wp.atomic_add(diagonal_xs, sa, xs_a)
                 wp.atomic_add(diagonal_xs, sb, -xs_b)
                 wp.atomic_add(diagonal_ss, sa, ss)
@@ -180,6 +209,7 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     bend_angle, bend_stiffness = functions(variant).angle, functions(variant).stiffness
+    presence = vanishing.functions(variant).presence
 
     @variant.kernel("energy")
     def bending_energy(
@@ -188,6 +218,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         yarn_direction: wp.array(dtype=int),
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
@@ -198,9 +229,12 @@ def define_energy(variant: Variant) -> wp.Kernel:
         b = bend_nodes[e][2]
         direction = yarn_direction[bend_yarn[e]]
         rest = euler[2 * b + direction] - euler[2 * a + direction]
-        t1 = wp.normalize(position[b] - position[c])
-        t2 = wp.normalize(position[a] - position[c])
-        wp.atomic_add(energy, 0, bend_stiffness(bend[bend_yarn[e]], radius[0]) * bend_angle(t1, t2)[0] / rest)
+        e1 = position[b] - position[c]
+        e2 = position[a] - position[c]
+        fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
+        square = bend_angle(wp.normalize(e1), wp.normalize(e2))[0]
+        faded = square * fading + scalar(wp.static(FLAT)) * (scalar(1.0) - fading)
+        wp.atomic_add(energy, 0, bend_stiffness(bend[bend_yarn[e]], radius[0]) * faded / rest)
 
     return bending_energy
 
@@ -209,6 +243,7 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     f = functions(variant)
     bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
+    presence, inverse_length = vanishing.functions(variant).presence, vanishing.functions(variant).inverse_length
 
     @variant.kernel("terms")
     def bending_contact_load(
@@ -217,6 +252,7 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
         yarn_direction: wp.array(dtype=int),
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         normal: wp.array(dtype=vec3),
@@ -237,9 +273,13 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
         k = scalar(2.0) * bend_stiffness(bend[bend_yarn[e]], radius[0]) / rest
-        angle_over_sine = bend_angle(t1, t2)[1]
-        f_b = bend_force(t1, t2, wp.length(e1), k, angle_over_sine) * half
-        f_a = bend_force(t2, t1, wp.length(e2), k, angle_over_sine) * half
+        s1 = presence(wp.length(e1), spacing[0])
+        s2 = presence(wp.length(e2), spacing[0])
+        by_l1 = inverse_length(wp.length(e1), spacing[0])
+        by_l2 = inverse_length(wp.length(e2), spacing[0])
+        angle = bend_angle(t1, t2)
+        f_b = bend_force(t1, t2, by_l1, s1, s2, k, angle[0], angle[1]) * half
+        f_a = bend_force(t2, t1, by_l2, s2, s1, k, angle[0], angle[1]) * half
         wp.atomic_add(contact_load, a, wp.dot(normal[a], f_a))
         wp.atomic_add(contact_load, b, wp.dot(normal[b], f_b))
         wp.atomic_add(contact_load, c, -wp.dot(normal[c], f_a + f_b))

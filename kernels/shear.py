@@ -8,11 +8,13 @@
 
 where the corner can jam (its crossing is flipped against both neighbours), and 1 elsewhere. The force is minus the
 gradient of the whole energy, dk/dφ included. Beyond the right angle γ is negative, which would turn eq. 5's stiffness
-negative near φ = π, so γ is taken as 0 there: γ³ stays twice differentiable.
+negative near φ = π, so γ is taken as 0 there: γ³ stays twice differentiable. Where a neighbour is nearly at the place
+of the crossing, V is between this and the energy at φ = 0 (``vanishing.py``).
 
 Parameters: ``shear`` S [Pa]; ``spacing`` L and ``radius`` R [m].
 
-The matrix is the Gauss-Newton part, (V'/(φ − φ̄)) ∇φ ∇φᵀ, its factor clamped at 0: exact at the right angle.
+The matrix is the Gauss-Newton part, (V'/(φ − φ̄)) ∇φ ∇φᵀ, its factor clamped at 0: exact at the right angle; and of a
+shrinking segment the positive part of the curvature along it.
 """
 
 import functools
@@ -20,6 +22,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import vanishing
 from .variant import Term, Variant
 
 LOCK_EXPONENT = 3
@@ -67,6 +70,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
     shear_lock, shear_angle = functions(variant).lock, functions(variant).angle
+    presence, inverse_length = vanishing.functions(variant).presence, vanishing.functions(variant).inverse_length
 
     @variant.kernel("terms")
     def shear_term(
@@ -101,18 +105,31 @@ def define(variant: Variant) -> wp.Kernel:
         strain = phi - scalar(wp.static(0.5 * wp.PI))
         pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
         k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
+        s_p = presence(wp.length(e1), spacing[0])
+        s_r = presence(wp.length(e2), spacing[0])
+        gain = scalar(0.0)
+        if s_p[0] * s_r[0] < scalar(1.0):
+            now = strain * strain
+            shut = scalar(wp.static(0.25 * wp.PI * wp.PI))
+            if corner_jams[e] != 0:
+                now *= shear_lock(phi, radius[0], spacing[0])[0]
+                shut *= shear_lock(scalar(0.0), radius[0], spacing[0])[0]
+            gain = scalar(0.5) * k * (now - shut)
         if corner_jams[e] != 0:
             lock = shear_lock(phi, radius[0], spacing[0])
             k *= lock[0] + scalar(0.5) * lock[1] * strain
         # ∇φ; where the corner is folded flat its direction is undefined, and normalize gives 0
         across = wp.dot(t1, t2)
-        g_p = wp.normalize(t1 * across - t2) / wp.length(e1)
-        g_r = wp.normalize(t2 * across - t1) / wp.length(e2)
+        g_p = wp.normalize(t1 * across - t2) * inverse_length(wp.length(e1), spacing[0])
+        g_r = wp.normalize(t2 * across - t1) * inverse_length(wp.length(e2), spacing[0])
         g_c = -(g_p + g_r)
+        k *= s_p[0] * s_r[0]
         moment = k * strain
-        wp.atomic_add(force, p, g_p * (-moment))
-        wp.atomic_add(force, r, g_r * (-moment))
-        wp.atomic_add(force, c, g_c * (-moment))
+        f_p = g_p * moment + t1 * (gain * s_p[1] * s_r[0])
+        f_r = g_r * moment + t2 * (gain * s_r[1] * s_p[0])
+        wp.atomic_add(force, p, -f_p)
+        wp.atomic_add(force, r, -f_r)
+        wp.atomic_add(force, c, f_p + f_r)
 
         if matrix != 0:
             stiffness = weights[0][2] * wp.max(k, scalar(0.0))
@@ -134,6 +151,16 @@ def define(variant: Variant) -> wp.Kernel:
                 wp.atomic_add(upper_xx, blocks[2], wp.outer(g_p, g_r) * stiffness)
             else:
                 wp.atomic_add(upper_xx, blocks[2], wp.outer(g_r, g_p) * stiffness)
+            if s_p[2] < scalar(0.0):
+                along = wp.outer(t1, t1) * (weights[0][2] * gain * s_p[2] * s_r[0])
+                wp.atomic_add(diagonal_xx, p, along)
+                wp.atomic_add(diagonal_xx, c, along)
+                wp.atomic_add(upper_xx, blocks[0], -along)
+            if s_r[2] < scalar(0.0):
+                along = wp.outer(t2, t2) * (weights[0][2] * gain * s_r[2] * s_p[0])
+                wp.atomic_add(diagonal_xx, r, along)
+                wp.atomic_add(diagonal_xx, c, along)
+                wp.atomic_add(upper_xx, blocks[1], -along)
 
     return shear_term
 
@@ -141,6 +168,7 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     shear_lock, shear_angle = functions(variant).lock, functions(variant).angle
+    presence = vanishing.functions(variant).presence
 
     @variant.kernel("energy")
     def shear_energy(
@@ -155,13 +183,19 @@ def define_energy(variant: Variant) -> wp.Kernel:
     ):
         e = wp.tid()
         c = corner_nodes[e][1]
-        phi = shear_angle(position[corner_nodes[e][0]] - position[c], position[corner_nodes[e][2]] - position[c])
+        e1 = position[corner_nodes[e][0]] - position[c]
+        e2 = position[corner_nodes[e][2]] - position[c]
+        fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
+        phi = shear_angle(e1, e2)
         strain = phi - scalar(wp.static(0.5 * wp.PI))
         pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
         k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
+        largest = k * scalar(wp.static(0.25 * wp.PI * wp.PI))
         if corner_jams[e] != 0:
             k *= shear_lock(phi, radius[0], spacing[0])[0]
-        wp.atomic_add(energy, 0, scalar(0.5) * k * strain * strain)
+            largest *= shear_lock(scalar(0.0), radius[0], spacing[0])[0]
+        faded = k * strain * strain * fading + largest * (scalar(1.0) - fading)
+        wp.atomic_add(energy, 0, scalar(0.5) * faded)
 
     return shear_energy
 

@@ -89,6 +89,8 @@ def make_state(c: wy.Cloth, name: str, sliding: bool = True) -> wy.State:
     slack       every segment of 0.7 of its length, on a grid 0.04 L rough
     folded      the yarn of row 1 turns back at column 2, to more than 170 degrees
     flat        the yarn of row 1 turns back exactly onto itself, in a cloth otherwise at rest
+    collapsed   random, with two neighbours of a node within 0.05 L of it
+    squeezed    random, with neighbouring crossings, and a crossing and the end of its yarn, within 0.1 R along the yarn
     """
     rng = np.random.default_rng(zlib.crc32(f"{c.weave.name} {name}".encode()))
     rows, columns, length = c.weave.rows, c.weave.columns, c.spacing
@@ -99,16 +101,23 @@ def make_state(c: wy.Cloth, name: str, sliding: bool = True) -> wy.State:
         + _lines(rng, columns, length, name)[None, :, None] * along
         + _lines(rng, rows, length, name)[:, None, None] * across
     )
-    jitter = {"random": 0.15, "slack": 0.04, "folded": 0.04}.get(name, 0.0)
+    jitter = {"slack": 0.04, "folded": 0.04, "rest": 0.0, "stretched": 0.0, "flat": 0.0}.get(name, 0.15)
     x = x + rng.uniform(-jitter, jitter, x.shape) * length
     if name in ("folded", "flat"):
         turned = x[1, 3:] - x[1, 2]
         x[1, 3:] -= 2.0 * (turned @ along)[:, None] * along
         if name == "folded":
             x[1, 3:] += 0.06 * length * np.cross(along, across)
+    if name == "collapsed":
+        x[1, 2] = x[1, 1] + np.array([0.03, -0.02, 0.01]) * length
+        x[2, 1] = x[1, 1] + np.array([0.01, 0.04, 0.02]) * length
     inside = (c.topology.is_crossing != 0)[:, None] * float(sliding)
     moving = name not in ("rest", "flat")
     euler = c.euler + rng.uniform(-0.08, 0.08, (c.nodes, 2)) * length * inside * moving
+    if name == "squeezed":
+        euler[c.node(1, 2), 0] = euler[c.node(1, 1), 0] + 0.1 * c.radius
+        euler[c.node(2, -2), 0] = euler[c.node(2, -1), 0] - 0.02 * c.radius
+        euler[c.node(1, 1), 1] = 0.05 * c.radius
     velocity = rng.normal(0.0, 0.5, (c.nodes, 3)) * moving
     euler_velocity = rng.normal(0.0, 0.2, (c.nodes, 2)) * inside * moving
     anchor = euler + rng.uniform(-5e-5, 5e-5, (c.nodes, 2)) * inside * moving

@@ -1,13 +1,14 @@
 """Bending of a yarn at a crossing."""
 
 import functools
+import math
 
 import numpy as np
 import pytest
 import torch
 from cases import Case, cases
 from checks import InternalChecks, check_definite, error, matrix
-from reference import Tensor, angle, bending, clamped, tensor, unit
+from reference import Tensor, angle, clamped, presence, tensor, unit
 from torch.func import grad, hessian, vmap
 from warp_yarn.kernels.bending import SERIES_BELOW
 
@@ -51,6 +52,46 @@ class TestBending(InternalChecks):
             return elements.matrix(elements.hessians(case.q), len(case.q))
         q, k = case.q[elements.unknowns], elements.parameters[0]
         return elements.matrix(vmap(within_plane)(q, k) + vmap(across_plane)(q, k), len(case.q))
+
+
+def fading(q: Tensor, k: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """s(l₁) s(l₂), and what a matrix has of it: the second derivative of (1 − s) k π²/Δs in Δs, and the positive parts
+    of that of V in each length with the angle held."""
+    e1, e2 = q[6:9] - q[3:6], q[0:3] - q[3:6]
+    rest = q[10] - q[9]
+    gain = k * (bend(q) ** 2 - math.pi**2) / rest
+    part = presence(e1, spacing) * presence(e2, spacing)
+    by_rest = tensor([0.0] * 9 + [-1.0, 1.0])
+    total = 2.0 * (1.0 - part) * k * math.pi**2 / rest**3 * torch.outer(by_rest, by_rest)
+    for e, other, ends in ((e1, e2, (6, 3)), (e2, e1, (0, 3))):
+
+        def fade(stretched: Tensor, e: Tensor = e) -> Tensor:
+            return presence(unit(e) * stretched, spacing)
+
+        second = (gain * hessian(fade)(torch.linalg.vector_norm(e))).clamp(min=0.0)
+        g = torch.zeros(11, dtype=torch.float64)
+        g = g.index_add(0, torch.arange(ends[0], ends[0] + 3), unit(e))
+        g = g.index_add(0, torch.arange(ends[1], ends[1] + 3), -unit(e))
+        total = total + second * presence(other, spacing) * torch.outer(g, g)
+    return part, total
+
+
+class TestCollapsedSegments(TestBending):
+    """Two neighbours of a node within 0.05 L of it."""
+
+    cases = cases(states=("collapsed",))
+    step = 2e-8
+    """A thousandth of the shortest segment."""
+    tolerance_of_differences = 1e-8
+    """Of fourth-order differences over 1e-3 of that length, and 1e-16/1e-5 for rounding."""
+
+    def expected_matrix(self, case: Case) -> Tensor:
+        """The same fades out, and the positive part of how it fades comes in."""
+        elements = self.oracle(case).bending
+        q, k = case.q[elements.unknowns], elements.parameters[0]
+        fade, along = vmap(functools.partial(fading, spacing=case.cloth.spacing))(q, k)
+        blocks = vmap(within_plane)(q, k) + vmap(across_plane)(q, k)
+        return elements.matrix(fade[:, None, None] * blocks + along, len(case.q))
 
 
 @pytest.mark.parametrize("case", cases(states=("rest", "stretched")), ids=str)
@@ -122,7 +163,7 @@ def test_flat_fold_is_finite(name: str) -> None:
     sim, o, n = case.simulator("bending"), case.oracle("bending"), case.cloth.nodes
     q, k = case.q[o.bending.unknowns], o.bending.parameters[0]
     assert float(vmap(bend)(q).max()) == np.pi
-    assert error(sim.energy(case.state)["bending"], vmap(bending)(q, k).sum()) < 1e-14
+    assert error(sim.energy(case.state)["bending"], vmap(o.bending.local)(q, k).sum()) < 1e-14
     x, s = sim.forces(case.state)["bending"]
     assert np.isfinite(x).all()
     assert error(s.ravel(), o.force("bending", case.q, case.v, case.anchor)[3 * n :]) < 1e-14

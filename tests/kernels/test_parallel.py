@@ -10,6 +10,8 @@ from reference import Tensor
 
 import warp_yarn as wy
 
+SQUEEZED = cases(states=("squeezed",), sliding=(True,))
+
 
 class TestParallel(EnergyChecks):
     term = "parallel"
@@ -19,6 +21,52 @@ class TestParallel(EnergyChecks):
         """The exact second derivative, which is positive semi-definite."""
         elements = self.oracle(case).parallel
         return elements.matrix(elements.hessians(case.q), len(case.q))
+
+
+class TestBarrier(TestParallel):
+    """Crossings within a tenth of the radius of one another, and of the end of a yarn."""
+
+    cases = SQUEEZED
+    step = 1e-8
+    """A thousandth of the least Δs."""
+    tolerance = 1e-12
+    """Coordinates of 6e-3 m leave 1e-18 m of that Δs."""
+
+
+@pytest.mark.parametrize("case", SQUEEZED, ids=str)
+def test_barrier_is_twice_differentiable_where_it_ends(case: Case) -> None:
+    """Just within its reach its force is the square of the way, so that neither force nor matrix has a jump."""
+    sim, c = case.simulator("parallel"), case.cloth
+    a, b = c.node(1, 1), c.node(1, 2)
+
+    def force(rest: float) -> float:
+        euler = c.euler.copy()
+        euler[b, 0] = euler[a, 0] + rest * 0.2 * c.radius
+        return float(sim.forces(dataclasses.replace(sim.state, euler=euler, anchor=None))["parallel"][1][a, 0])
+
+    penalty = force(1.5)
+    within = [force(x) - penalty for x in (0.99, 0.98)]
+    # the penalty goes on linearly
+    slope = c.parallel_stiffness * c.spacing * 0.2 * c.radius
+    guard = [-(f + slope * (1.5 - x)) for f, x in zip(within, (0.99, 0.98), strict=True)]
+    # 2 left log + left²/x of left = 1 − x is 3 left² to within left
+    stiffness = c.yarns[c.warp[1]].stretch * np.pi * c.radius**2 + c.parallel_stiffness * c.spacing
+    assert guard[0] == pytest.approx(stiffness * 3.0 * 0.01**2, rel=0.02)
+    assert guard[1] == pytest.approx(stiffness * 3.0 * 0.02**2, rel=0.04)
+
+
+def test_barrier_grows_without_bound() -> None:
+    """At least as 1/Δs: no speed of a crossing gets through."""
+    sim, state = SQUEEZED[0].simulator("parallel"), SQUEEZED[0].state
+    c = SQUEEZED[0].cloth
+    a, b = c.node(1, 1), c.node(1, 2)
+    forces = []
+    for rest in (1e-7, 1e-9, 1e-11):
+        euler = state.euler.copy()
+        euler[a, 0] = 1e-3
+        euler[b, 0] = 1e-3 + rest
+        forces.append(sim.forces(dataclasses.replace(state, euler=euler))["parallel"][1][b, 0])
+    assert np.all(np.diff(np.log10(forces)) > 1.99)
 
 
 @pytest.mark.parametrize("weave", ["plain", "twill"])

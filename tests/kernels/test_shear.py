@@ -8,8 +8,8 @@ import pytest
 import torch
 from cases import BENT, YARNS, Case, cases
 from checks import DIFFERENCES, InternalChecks, TermChecks, difference, error, force_of
-from reference import RIGHT, Elements, Tensor, angle, lock, unit
-from torch.func import grad, vmap
+from reference import RIGHT, Elements, Tensor, angle, lock, presence, unit
+from torch.func import grad, hessian, vmap
 
 import warp_yarn as wy
 
@@ -25,14 +25,31 @@ def gauss_newton(elements: Elements, q: Tensor, spacing: float, radius: float) -
     def energy(phi: Tensor, k: Tensor, jams: Tensor) -> Tensor:
         return 0.5 * k * torch.where(jams, lock(phi, spacing, radius), 1.0) * (phi - RIGHT) ** 2
 
+    def fades(q: Tensor, k: Tensor, jams: Tensor) -> tuple[Tensor, Tensor]:
+        """s(l_p) s(l_r), and the positive parts of the second derivatives in each length with the angle held."""
+        e1, e2 = q[0:3] - q[3:6], q[6:9] - q[3:6]
+        total = torch.zeros(9, 9, dtype=torch.float64)
+        largest = 0.5 * k * RIGHT**2 * torch.where(jams, lock(torch.zeros_like(k), spacing, radius), 1.0)
+        gain = energy(corner(q), k, jams) - largest
+        for e, other, sign in ((e1, e2, (1.0, -1.0, 0.0)), (e2, e1, (0.0, -1.0, 1.0))):
+
+            def fade(length: Tensor, e: Tensor = e) -> Tensor:
+                return presence(unit(e) * length, spacing)
+
+            second = (gain * hessian(fade)(torch.linalg.vector_norm(e))).clamp(min=0.0)
+            g = torch.cat([s * unit(e) for s in sign])
+            total = total + second * presence(other, spacing) * torch.outer(g, g)
+        return presence(e1, spacing) * presence(e2, spacing), total
+
     local = q[elements.unknowns]
+    fade, along = vmap(fades)(local, *elements.parameters)
     phi = vmap(corner)(local)
     strain = phi - RIGHT
     at_rest = strain.abs() < 1e-9
     slope = vmap(grad(energy))(phi, *elements.parameters) / torch.where(at_rest, 1.0, strain)
     factor = torch.where(at_rest, vmap(grad(grad(energy)))(phi, *elements.parameters), slope).clamp(min=0.0)
     g = vmap(grad(corner))(local)
-    return elements.matrix(factor[:, None, None] * g[:, :, None] * g[:, None, :], len(q))
+    return elements.matrix((fade * factor)[:, None, None] * g[:, :, None] * g[:, None, :] + along, len(q))
 
 
 class TestShear(InternalChecks):
@@ -48,6 +65,16 @@ class TestShear(InternalChecks):
         """Or the cases above would test little."""
         jams = self.oracle(case).elements("shear", case.q).parameters[1]
         assert 0 < int(jams.sum()) < len(jams)
+
+
+class TestCollapsedSegments(TestShear):
+    """Two neighbours of a crossing within 0.05 L of it."""
+
+    cases = cases(states=("collapsed",))
+    step = 2e-8
+    """A thousandth of the shortest segment."""
+    tolerance_of_differences = 1e-8
+    """Of fourth-order differences over 1e-3 of that length, and 1e-16/1e-5 for rounding."""
 
 
 class TestPressedShear(TermChecks):
