@@ -13,8 +13,8 @@ of the crossing, V is between this and the energy at φ = 0 (``vanishing.py``).
 
 Parameters: ``shear`` S [Pa]; ``spacing`` L and ``radius`` R [m].
 
-The matrix is the Gauss-Newton part, (V'/(φ − φ̄)) ∇φ ∇φᵀ, its factor clamped at 0: exact at the right angle; and of a
-shrinking segment the positive part of the curvature along it.
+The matrix is V'' ∇φ ∇φᵀ, its factor clamped at 0: exact at the right angle; and of a shrinking segment the positive
+part of the curvature along it.
 """
 
 import functools
@@ -32,33 +32,44 @@ LOCK_SMOOTHNESS = 0.6
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
-    vec2 = wp.types.vector(2, scalar)
 
     @wp.func
-    def shear_lock(phi: scalar, radius: scalar, spacing: scalar) -> vec2:
-        """(lock, d lock/dφ) of eq. 5."""
+    def shear_lock(phi: scalar, radius: scalar, spacing: scalar) -> vec3:
+        """(lock, its first and second derivative by φ) of eq. 5."""
         one = scalar(1.0)
         right = scalar(wp.static(0.5 * wp.PI))
         sigma = scalar(LOCK_SMOOTHNESS)
         threshold = scalar(2.0) * wp.asin(radius / spacing)
         half = scalar(0.5) * phi
-        gamma = wp.max((wp.sqrt(scalar(2.0)) - scalar(2.0) * wp.sin(half)) * spacing / radius, scalar(0.0))
+        sine = wp.sin(half)
+        gamma = wp.max((wp.sqrt(scalar(2.0)) - scalar(2.0) * sine) * spacing / radius, scalar(0.0))
         gamma_rate = -wp.cos(half) * spacing / radius
+        gamma_rate2 = scalar(0.5) * sine * spacing / radius
+        two = scalar(2.0)
         boost = gamma * gamma * gamma
         boost_rate = scalar(LOCK_EXPONENT) * gamma * gamma * gamma_rate
+        boost_rate2 = scalar(LOCK_EXPONENT) * gamma * (two * gamma_rate * gamma_rate + gamma * gamma_rate2)
         a = phi - threshold
         b = phi - right
         product = phi * a * b
         product_rate = a * b + phi * b + phi * a
+        product_rate2 = two * (phi + a + b)
         right2 = right * right
         right4 = right2 * right2
         below = product * product + right4 * sigma * sigma
+        below_rate = two * product * product_rate
+        below_rate2 = two * (product_rate * product_rate + product * product_rate2)
         z = right4 * right * a / below
-        z_rate = right4 * right * (below - a * scalar(2.0) * product * product_rate) / (below * below)
+        z_rate = right4 * right * (below - a * below_rate) / (below * below)
+        z_rate2 = right4 * right * (-two * below_rate - a * below_rate2 + two * a * below_rate * below_rate / below)
+        z_rate2 /= below * below
         s = wp.tanh(z)
         lock = scalar(0.5) * ((one + boost) + (one - boost) * s)
-        rate = scalar(0.5) * (boost_rate * (one - s) + (one - boost) * (one - s * s) * z_rate)
-        return vec2(lock, rate)
+        s_rate = (one - s * s) * z_rate
+        s_rate2 = (one - s * s) * (z_rate2 - two * s * z_rate * z_rate)
+        rate = scalar(0.5) * (boost_rate * (one - s) + (one - boost) * s_rate)
+        rate2 = scalar(0.5) * (boost_rate2 * (one - s) - two * boost_rate * s_rate + (one - boost) * s_rate2)
+        return vec3(lock, rate, rate2)
 
     @wp.func
     def shear_angle(e1: vec3, e2: vec3) -> scalar:
@@ -115,8 +126,10 @@ def define(variant: Variant) -> wp.Kernel:
                 now *= shear_lock(phi, radius[0], spacing[0])[0]
                 shut *= shear_lock(scalar(0.0), radius[0], spacing[0])[0]
             gain = scalar(0.5) * k * (now - shut)
+        curvature = k
         if corner_jams[e] != 0:
             lock = shear_lock(phi, radius[0], spacing[0])
+            curvature *= lock[0] + scalar(2.0) * strain * lock[1] + scalar(0.5) * strain * strain * lock[2]
             k *= lock[0] + scalar(0.5) * lock[1] * strain
         # ∇φ; where the corner is folded flat its direction is undefined, and normalize gives 0
         across = wp.dot(t1, t2)
@@ -132,7 +145,7 @@ def define(variant: Variant) -> wp.Kernel:
         wp.atomic_add(force, c, f_p + f_r)
 
         if matrix != 0:
-            stiffness = weights[0][2] * wp.max(k, scalar(0.0))
+            stiffness = weights[0][2] * wp.max(curvature, scalar(0.0)) * s_p[0] * s_r[0]
             wp.atomic_add(diagonal_xx, p, wp.outer(g_p, g_p) * stiffness)
             wp.atomic_add(diagonal_xx, r, wp.outer(g_r, g_r) * stiffness)
             wp.atomic_add(diagonal_xx, c, wp.outer(g_c, g_c) * stiffness)

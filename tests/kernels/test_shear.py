@@ -20,7 +20,7 @@ def corner(q: Tensor) -> Tensor:
 
 
 def gauss_newton(elements: Elements, q: Tensor, spacing: float, radius: float) -> Tensor:
-    """(V'/(φ − π/2)) ∇φ ∇φᵀ of every corner, the factor at least 0; at the right angle it is V''."""
+    """V'' ∇φ ∇φᵀ of every corner, the factor at least 0."""
 
     def energy(phi: Tensor, k: Tensor, jams: Tensor) -> Tensor:
         return 0.5 * k * torch.where(jams, lock(phi, spacing, radius), 1.0) * (phi - RIGHT) ** 2
@@ -44,10 +44,7 @@ def gauss_newton(elements: Elements, q: Tensor, spacing: float, radius: float) -
     local = q[elements.unknowns]
     fade, along = vmap(fades)(local, *elements.parameters)
     phi = vmap(corner)(local)
-    strain = phi - RIGHT
-    at_rest = strain.abs() < 1e-9
-    slope = vmap(grad(energy))(phi, *elements.parameters) / torch.where(at_rest, 1.0, strain)
-    factor = torch.where(at_rest, vmap(grad(grad(energy)))(phi, *elements.parameters), slope).clamp(min=0.0)
+    factor = vmap(grad(grad(energy)))(phi, *elements.parameters).clamp(min=0.0)
     g = vmap(grad(corner))(local)
     return elements.matrix((fade * factor)[:, None, None] * g[:, :, None] * g[:, None, :] + along, len(q))
 
