@@ -5,6 +5,9 @@
 n is the unit normal from warp to weft: the normal of the best-fit plane of the crossing and its four neighbours (the
 eigenvector of the smallest eigenvalue of their covariance), signed along (x_right − x_left) × (x_down − x_up), and
 reversed where the draft puts the other yarn on top. Border nodes have no normal, and so neither crimp nor contact.
+Where warp and weft come to run along each other that sign jumps and the plane may be any through their line, so n fades
+out over the last of the sine of the angle between them, σ = |n·(a × b)|/(|a||b|) of a = x_right − x_left and
+b = x_down − x_up: its length is x³ (10 − 15 x + 6 x²) of x = σ/0.05, and 1 from there on.
 
 Two arrays carry it to shear and friction: ``normal``, and ``contact_load``, the sum inside the ReLU, to which each term
 that presses yarns together adds its part (``contact_load`` in its own file).
@@ -16,6 +19,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from .variant import Variant
+
+FADING = 0.05
+"""Sine of the angle between warp and weft under which a crossing's normal fades: 3 degrees, far beyond any lock."""
 
 
 @functools.cache
@@ -109,11 +115,20 @@ def define_normal(variant: Variant) -> wp.Kernel:
         covariance = wp.outer(left, left) + wp.outer(right, right) + wp.outer(up, up) + wp.outer(down, down)
         covariance -= wp.outer(total, total) * scalar(0.2)
         n = plane_normal(covariance)
-        side = wp.dot(n, wp.cross(right - left, down - up))
+        across = right - left
+        along = down - up
+        side = wp.dot(n, wp.cross(across, along))
+        size = wp.length(across) * wp.length(along)
+        sine = scalar(0.0)
+        if size > scalar(0.0):
+            sine = wp.abs(side) / size
         if flipped[i] != 0:
             side = -side
         if side < scalar(0.0):
             n = -n
+        x = sine / scalar(wp.static(FADING))
+        if x < scalar(1.0):
+            n *= x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x))
         normal[i] = n
 
     return contact_normal

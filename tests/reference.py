@@ -332,7 +332,11 @@ class Oracle:
         centered = points - points.mean(dim=0)
         covariance = torch.einsum("pca,pcb->cab", centered, centered)
         n = torch.linalg.eigh(covariance)[1][:, :, 0]
-        side = torch.sum(n * torch.linalg.cross(x[right] - x[left], x[down] - x[up]), dim=1)
+        a, b = x[right] - x[left], x[down] - x[up]
+        side = torch.sum(n * torch.linalg.cross(a, b), dim=1)
+        sine = side.abs() / (torch.linalg.vector_norm(a, dim=1) * torch.linalg.vector_norm(b, dim=1))
+        y = torch.clamp(sine / 0.05, max=1.0)
+        n = n * (6.0 * y**5 - 15.0 * y**4 + 10.0 * y**3)[:, None]
         sign = torch.where(side < 0.0, -1.0, 1.0)
         sign = sign * tensor([-1.0 if self.flipped[j][i] else 1.0 for j, i in self.crossings()])
         normal = torch.zeros_like(x).index_put((torch.tensor(at),), n * sign.detach()[:, None])
