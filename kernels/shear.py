@@ -13,8 +13,8 @@ of the crossing, V is between this and the energy at φ = 0 (``vanishing.py``).
 
 Parameters: ``shear`` S [Pa]; ``spacing`` L and ``radius`` R [m].
 
-The matrix is V'' ∇φ ∇φᵀ, its factor clamped at 0: exact at the right angle; and of a shrinking segment the positive
-part of the curvature along it.
+The matrix is the Gauss-Newton part, (V'/(φ − φ̄)) ∇φ ∇φᵀ, exact at the right angle; V'' in place of its factor where the
+lock makes V'' larger, up to four times so; and of a shrinking segment the positive part of the curvature along it.
 """
 
 import functools
@@ -25,6 +25,9 @@ import warp as wp
 from . import vanishing
 from .variant import Term, Variant
 
+OF_CURVATURE = 0.8
+"""The part of V'' that the matrix has at least: little enough that V'/(φ − φ̄), which it is in ordinary motion, is more
+within 25 degrees of the right angle."""
 LOCK_EXPONENT = 3
 LOCK_SMOOTHNESS = 0.6
 
@@ -137,6 +140,7 @@ def define(variant: Variant) -> wp.Kernel:
         g_r = wp.normalize(t2 * across - t1) * inverse_length(wp.length(e2), spacing[0])
         g_c = -(g_p + g_r)
         k *= s_p[0] * s_r[0]
+        curvature *= s_p[0] * s_r[0]
         moment = k * strain
         f_p = g_p * moment + t1 * (gain * s_p[1] * s_r[0])
         f_r = g_r * moment + t2 * (gain * s_r[1] * s_p[0])
@@ -145,7 +149,7 @@ def define(variant: Variant) -> wp.Kernel:
         wp.atomic_add(force, c, f_p + f_r)
 
         if matrix != 0:
-            stiffness = weights[0][2] * wp.max(curvature, scalar(0.0)) * s_p[0] * s_r[0]
+            stiffness = weights[0][2] * wp.max(k, scalar(wp.static(OF_CURVATURE)) * curvature)
             wp.atomic_add(diagonal_xx, p, wp.outer(g_p, g_p) * stiffness)
             wp.atomic_add(diagonal_xx, r, wp.outer(g_r, g_r) * stiffness)
             wp.atomic_add(diagonal_xx, c, wp.outer(g_c, g_c) * stiffness)

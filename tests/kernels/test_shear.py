@@ -20,7 +20,7 @@ def corner(q: Tensor) -> Tensor:
 
 
 def gauss_newton(elements: Elements, q: Tensor, spacing: float, radius: float) -> Tensor:
-    """V'' ∇φ ∇φᵀ of every corner, the factor at least 0."""
+    """max(V'/(φ − π/2), 0.8 V'') ∇φ ∇φᵀ of every corner; at the right angle the factor is V''."""
 
     def energy(phi: Tensor, k: Tensor, jams: Tensor) -> Tensor:
         return 0.5 * k * torch.where(jams, lock(phi, spacing, radius), 1.0) * (phi - RIGHT) ** 2
@@ -44,7 +44,11 @@ def gauss_newton(elements: Elements, q: Tensor, spacing: float, radius: float) -
     local = q[elements.unknowns]
     fade, along = vmap(fades)(local, *elements.parameters)
     phi = vmap(corner)(local)
-    factor = vmap(grad(grad(energy)))(phi, *elements.parameters).clamp(min=0.0)
+    strain = phi - RIGHT
+    at_rest = strain.abs() < 1e-9
+    slope = vmap(grad(energy))(phi, *elements.parameters) / torch.where(at_rest, 1.0, strain)
+    curvature = vmap(grad(grad(energy)))(phi, *elements.parameters)
+    factor = torch.where(at_rest, curvature, torch.maximum(slope, 0.8 * curvature))
     g = vmap(grad(corner))(local)
     return elements.matrix((fade * factor)[:, None, None] * g[:, :, None] * g[:, None, :] + along, len(q))
 
