@@ -8,7 +8,9 @@ along, so that k_f |δ| never exceeds μF_n.
 
 A single p for a length (~1e-6 m) and a force (~1e-4 N) makes both tanh arguments ≪ 1: with the published p = 10 the law
 neither sticks nor slips. So both are made dimensionless, δ by μF_n/k_f and forces by μF_n, with a floor under μF_n for
-slack crossings. ``published_scaling`` takes the arguments in SI units, as published.
+slack crossings. And the spring ends at μF_n within the step already, not when the anchor is dragged after it: a yarn
+that a step moves by many times μF_n/k_f would else be held by more than μF_n, the more the longer the step.
+``published_scaling`` takes eq. 4 as published, arguments in SI units.
 
 Parameters: ``friction`` μ; ``friction_stiffness`` k_f [N/m]; ``friction_damping`` d_f [N s/m];
 ``friction_sharpness`` p.
@@ -53,10 +55,15 @@ def functions(variant: Variant) -> SimpleNamespace:
         sign = wp.tanh(by_length * delta)
         stuck = wp.tanh(by_force * (limit - wp.abs(others)))
         spring = stiffness * delta
+        spring_slope = stiffness
+        if published_scaling == 0:
+            if wp.abs(spring) > limit:
+                spring = wp.sign(delta) * limit
+                spring_slope = scalar(0.0)
         half = scalar(0.5)
         one = scalar(1.0)
         f = -half * ((spring - sign * limit) * stuck + spring + sign * limit)
-        slope = half * stiffness * (one + stuck) + half * (one - stuck) * limit * by_length * (one - sign * sign)
+        slope = half * spring_slope * (one + stuck) + half * (one - stuck) * limit * by_length * (one - sign * sign)
         return vec2(f, slope)
 
     return SimpleNamespace(force=friction_force)

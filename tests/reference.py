@@ -399,4 +399,5 @@ class Oracle:
         per_length = 1.0 if self.scene.published_scaling else k
         sign = torch.tanh(p * delta * per_length / scale)
         stuck = torch.tanh(p * (limit - torch.abs(others)) / scale)
-        return -(0.5 * (k * delta - sign * limit) * stuck + 0.5 * (k * delta + sign * limit))
+        held = k * delta if self.scene.published_scaling else torch.clamp(k * delta, -limit, limit)
+        return -(0.5 * (held - sign * limit) * stuck + 0.5 * (held + sign * limit))
