@@ -1,0 +1,234 @@
+"""Where each time-stepping method is accurate, stable but damped, or broken, and what broke it.
+
+    python benchmarks/stability.py [--quick] [--png docs/stability.png]
+
+The paper's hung cloth in its wind, all terms, for 1/15 s. First a map for every method: time step (1e-4 to 1/30 s) by
+stretch modulus (a hundredth to a hundred times the paper's), 5 × 5 plain. Then, at the paper's modulus, the step by
+friction, weave, size and precision, one at a time: the full product would be some 10⁴ runs.
+
+Accurate: the positions at the end are within 5 % of the motion (root mean squares) of converged ones, those of the
+second-order method at 1/30 ms. Damped: stable, and farther off. Broken: the run ended in an error, or moved by thrice
+the converged motion. The line is where an explicit method ends, 2/ω of the stiffest mode of the cloth at rest with its
+yarns locked; with them sliding M is singular and there is none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tqdm
+import warp as wp
+from common import RESULTS, environment, one_core, write_csv
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+
+import warp_yarn as wy
+from warp_yarn import paper
+from warp_yarn.files import whole_file
+from warp_yarn.integrators import INTEGRATORS
+
+DURATION = 1.0 / 15.0
+COUNTS = (666, 200, 66, 20, 6, 2)
+"""Steps of each run: from 1e-4 to 1/30 s."""
+FINEST = 2000
+STRETCH = (1e-2, 1e-1, 1.0, 1e1, 1e2)
+ACCURATE, FAR = 0.05, 3.0
+VERDICTS = ("accurate", "stable, damped", "broken")
+COLORS = ("#5aae61", "#fee08b", "#d6604d")
+CAUSES = {"Δs": "Δs", "Newton": "Newton", "not finite": "inf", "solver": "solver"}
+"""What a message says, and its short name on the map."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A cloth: its stretch moduli in the paper's, and so on."""
+
+    stretch: float = 1.0
+    friction: float = 0.5
+    weave: str = "plain"
+    size: int = 5
+    precision: str = "double"
+
+    def scene(self, **options: Any) -> wy.Scene:
+        yarns = [dataclasses.replace(y, stretch=self.stretch * y.stretch) for y in (paper.YARNS[1], paper.YARNS[2])]
+        weave = wy.WEAVES[self.weave](rows=self.size, columns=self.size)
+        cloth = wy.Cloth(weave, yarns=yarns, shear=paper.SHEAR[1, 2], friction=self.friction)
+        return paper.hung(cloth, **options)
+
+    def counts(self) -> tuple[int, ...]:
+        """Of steps; large cloths at the longer steps alone."""
+        return COUNTS if self.size < 50 else COUNTS[3:]
+
+    def label(self) -> str:
+        """What sets it apart from the paper's."""
+        changed = {
+            f.name: getattr(self, f.name) for f in dataclasses.fields(self) if getattr(self, f.name) != f.default
+        }
+        if not changed:
+            return "the paper's"
+        (name, value), *_ = changed.items()
+        return {"size": f"{value} × {value}", "friction": f"μ = {value}"}.get(name, str(value))
+
+
+OTHERS = (
+    Case(),
+    Case(friction=0.0),
+    Case(friction=0.3),
+    Case(friction=1.0),
+    Case(weave="twill"),
+    Case(weave="satin"),
+    Case(size=3),
+    Case(size=17),
+    Case(size=33),
+    Case(size=100),
+    Case(precision="single"),
+)
+
+
+def end(case: Case, method: str, count: int) -> np.ndarray:
+    """Positions after the duration."""
+    simulator = wy.Simulator(case.scene(), step=DURATION / count, integrator=method, precision=case.precision)
+    while simulator.steps_done < count:
+        # in parts: of a long run no frames are kept
+        trajectory = simulator.run(min(50, count - simulator.steps_done))
+    return trajectory.position[-1]
+
+
+@functools.cache
+def converged(case: Case) -> np.ndarray | None:
+    """None where the method that makes it does not get through, or would take too long."""
+    if case.size > 20:
+        return None
+    try:
+        return end(dataclasses.replace(case, precision="double"), "sdirk2", FINEST)
+    except wy.SimulationError:
+        return None
+
+
+def size_of(x: np.ndarray) -> float:
+    return float(np.sqrt((x**2).sum(axis=1).mean()))
+
+
+def judge(case: Case, method: str, count: int) -> dict[str, Any]:
+    """A row of the table: what became of a run."""
+    row = {"method": method, **dataclasses.asdict(case), "step [s]": DURATION / count}
+    start = case.scene().cloth.position
+    try:
+        position = end(case, method, count)
+    except wy.SimulationError as error:
+        message = str(error)
+        cause = next((short for text, short in CAUSES.items() if text in message), "error")
+        return {**row, "verdict": VERDICTS[2], "error": "", "cause": cause, "message": message}
+    reference = converged(case)
+    if reference is None:
+        # nothing to compare with: a cloth of n rows cannot have moved farther than it would fall
+        broken = size_of(position - start) > 0.5 * 9.8 * DURATION**2 * FAR
+        return {**row, "verdict": VERDICTS[2 if broken else 1], "error": "", "cause": "far" * broken, "message": ""}
+    moved = size_of(reference - start)
+    error = size_of(position - reference) / moved
+    verdict = VERDICTS[0] if error <= ACCURATE else VERDICTS[1]
+    broken = size_of(position - start) > FAR * moved
+    return {
+        **row,
+        "verdict": VERDICTS[2] if broken else verdict,
+        "error": error,
+        "cause": "far" * broken,
+        "message": "",
+    }
+
+
+def explicit_limit(stretch: float) -> float:
+    """2/ω of the stiffest mode at rest, of the cloth with its yarns locked [s]."""
+    h = 1e-3
+    case = Case(stretch=stretch)
+    whole = wy.Simulator(case.scene(sliding=False, wind=None), step=h, integrator="linear").system()
+    mass = wy.Simulator(case.scene(sliding=False, wind=None, terms=["mass"]), step=h, integrator="linear").system()
+    m = mass.dense()
+    stiffness = (whole.dense() - m) / h**2
+    lower = np.linalg.inv(np.linalg.cholesky(m))
+    return 2.0 / float(np.sqrt(np.linalg.eigvalsh(lower @ stiffness @ lower.T).max()))
+
+
+def benchmark(maps: tuple[Case, ...], others: tuple[Case, ...], counts: tuple[int, ...]) -> list[dict[str, Any]]:
+    runs = [
+        (case, method, count)
+        for case in dict.fromkeys((*maps, *others))
+        for method in INTEGRATORS
+        for count in case.counts()
+        if count in counts
+    ]
+    return [judge(*run) for run in tqdm.tqdm(runs, unit="run", disable=None)]
+
+
+def draw(path: Path, rows: list[dict[str, Any]], maps: tuple[Case, ...], others: tuple[Case, ...]) -> None:
+    """A column of panels a method: the map above, the other factors below."""
+    found = {(row["method"], *(row[f.name] for f in dataclasses.fields(Case)), row["step [s]"]): row for row in rows}
+    steps = sorted({row["step [s]"] for row in rows})
+    figure = Figure(figsize=(1.0 + 3.4 * len(INTEGRATORS), 8.4), layout="constrained")
+    ratios = [len(maps), len(others)]
+    axes = figure.subplots(2, len(INTEGRATORS), squeeze=False, sharex=True, height_ratios=ratios)
+    for column, method in enumerate(INTEGRATORS):
+        for axis, cases in zip(axes[:, column], (maps, others), strict=True):
+            panel(axis, [[found.get((method, *dataclasses.astuple(case), h)) for h in steps] for case in cases])
+            labels = [f"×{case.stretch:g}" if cases is maps else case.label() for case in cases]
+            axis.set_yticks(range(len(cases)), labels if column == 0 else [])
+        top = axes[0, column]
+        limits = [explicit_limit(case.stretch) for case in maps]
+        at = np.interp(np.log(limits), np.log(steps), np.arange(len(steps)), left=-0.5)
+        top.plot(at, range(len(maps)), "k.-", linewidth=1.0)
+        row = [case.stretch for case in maps].index(1.0)
+        top.add_patch(Rectangle((-0.48, row - 0.48), len(steps) - 0.04, 0.96, fill=False, linewidth=2.0))
+        top.set_title(f"{method} (order {INTEGRATORS[method].order})")
+        axes[1, column].set_xticks(range(len(steps)), [f"{1e3 * h:.2g}" for h in steps])
+        axes[1, column].set_xlabel("time step (ms)")
+    axes[0, 0].set_ylabel("stretch modulus, in the paper's (boxed)")
+    legend = [Patch(color=color, label=verdict) for verdict, color in zip(VERDICTS, COLORS, strict=True)]
+    line = axes[0, 0].lines[0]
+    line.set_label("an explicit method's limit, yarns locked")
+    figure.legend(handles=[*legend, line], loc="outside lower center", ncols=4, frameon=False)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
+
+
+def panel(axis: Any, table: list[list[dict[str, Any] | None]]) -> None:
+    """Verdicts as colours, with the error in percent or what broke the run."""
+    values = [[np.nan if row is None else VERDICTS.index(row["verdict"]) for row in line] for line in table]
+    axis.imshow(values, cmap=ListedColormap(COLORS), vmin=0, vmax=2, aspect="auto")
+    for j, line in enumerate(table):
+        for i, row in enumerate(line):
+            if row is not None:
+                text = row["cause"] or (f"{100.0 * row['error']:.2g} %" if row["error"] != "" else "")
+                axis.text(i, j, text, ha="center", va="center", fontsize=7)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three steps, three moduli and small cloths alone")
+    parser.add_argument("--png", type=Path, default=Path("docs/stability.png"), help="(%(default)s)")
+    parser.add_argument("--output", type=Path, default=RESULTS / "stability.csv", help="CSV file (%(default)s)")
+    options = parser.parse_args()
+    one_core()
+    wp.config.log_level = wp.LOG_WARNING
+    maps, others, counts = tuple(Case(stretch=s) for s in STRETCH), OTHERS, COUNTS
+    if options.quick:
+        maps, counts = maps[::2], COUNTS[2::2]
+        others = tuple(case for case in others if case.size < 17)
+    about = environment("matplotlib")
+    rows = benchmark(maps, others, counts)
+    write_csv(options.output, rows, about)
+    options.png.parent.mkdir(parents=True, exist_ok=True)
+    draw(options.png, rows, maps, others)
+    for method in INTEGRATORS:
+        share = [sum(row["verdict"] == verdict for row in rows if row["method"] == method) for verdict in VERDICTS]
+        print(f"{method}:", ", ".join(f"{n} {verdict}" for n, verdict in zip(share, VERDICTS, strict=True)))
+    print("written:", options.output, options.png)
+
+
+if __name__ == "__main__":
+    main()
