@@ -157,7 +157,7 @@ def define(variant: Variant) -> SimpleNamespace:
         # right-hand side, and when to stop
         rhs: wp.array(dtype=vec3),
         euler_rhs: wp.array(dtype=scalar),
-        tolerance: scalar,
+        tolerance: wp.array(dtype=scalar),
         most_iterations: int,
         # start in, solution out
         solution: wp.array(dtype=vec3),
@@ -211,7 +211,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     p_s[s] = z_1
                     q_s[s] = zero
 
-        limit = tolerance * tolerance * size
+        limit = tolerance[0] * tolerance[0] * size
         count = int(0)
         while count < most_iterations and rz > limit:
             multiply(
