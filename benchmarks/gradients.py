@@ -82,7 +82,9 @@ class Case:
     def __init__(self, size: int, steps: int, every: int = 1, **options: Any):
         scene = paper.hung_cloth(rows=size, columns=size, **options)
         self.steps = steps
-        self.rollout = wt.Rollout(scene, steps, frames=[steps], checkpoint_every=every, step=paper.STEP)
+        self.rollout = wt.Rollout(
+            scene, steps, frames=[steps], checkpoint_every=every, step=paper.STEP, integrator="linear"
+        )
         self.inputs = inputs(self.rollout, [name for name in WANTED if scene.sliding or name != "euler_velocity"])
         self.ratios: list[float] = []
         self._forward = 0.0
@@ -194,7 +196,7 @@ def runs(simulator: wy.Simulator, steps: int) -> Callable[[], float]:
 def simulator_apart(size: int) -> wy.Simulator:
     """Of a process in which no Rollout and no adjoint was ever made."""
     wp.config.log_level = wp.LOG_WARNING
-    return wy.Simulator(paper.hung_cloth(rows=size, columns=size), step=paper.STEP)
+    return wy.Simulator(paper.hung_cloth(rows=size, columns=size), step=paper.STEP, integrator="linear")
 
 
 def run_apart(size: int, steps: int) -> float:
@@ -208,7 +210,7 @@ def forward_only(size: int, steps: int, repeats: int) -> dict[str, Any]:
     case.forward()
     case.backward()
     asked = case.rollout.simulator
-    plain = wy.Simulator(case.rollout.scene, step=paper.STEP)
+    plain = wy.Simulator(case.rollout.scene, step=paper.STEP, integrator="linear")
     # Spawned, so that it has nothing of this process; on the same core, as it inherits that.
     with multiprocessing.get_context("spawn").Pool(1) as apart:
         functions = [lambda: apart.apply(run_apart, (size, steps)), runs(plain, steps), runs(asked, steps)]
@@ -256,7 +258,7 @@ def error_table(
     weights = torch.randn(steps, *rest.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def gradients(tolerance: float) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        rollout = wt.Rollout(scene, steps, tolerance=tolerance, step=paper.STEP)
+        rollout = wt.Rollout(scene, steps, tolerance=tolerance, step=paper.STEP, integrator="linear")
         given = inputs(rollout, OF_THE_ERROR)
         position = rollout(**given).position
         (weights * (position[1:] - rest)).sum().backward()

@@ -2,7 +2,8 @@
 
     r(w) = η F(q, w) + M(q) (v₀ − w) = 0,   q = q₀ + η w
 
-Every implicit method here is made of such stages (``warp_yarn/integrators``). Newton's iteration takes A, the symmetric
+Every implicit method here is made of such stages, and of q₀ + t w and v₀ + k (w − v₀) that carry one to the next or to
+the end of a step (``warp_yarn/integrators``). Newton's iteration takes A, the symmetric
 positive definite part of −∂r/∂w, for its matrix: M + η D + η² H. The adjoint of a stage that has converged is
 (−∂r/∂w)ᵀ λ = w̄, with the exact derivative: ρ = w̄ + (∂r/∂w)ᵀ λ is driven to 0 with the same A.
 """
@@ -12,8 +13,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .step import NOT_FINITE
+from .step import NOT_FINITE, STALLED
 from .variant import Variant
+
+MOST_TRIES = 400
+"""Evaluations in a stage. Newton's iteration takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so
+that violent sliding brings them to dozens."""
+SHORTEST_STEP = 1.0 / 64.0
+"""Of the line search."""
+ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
+"""Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
 
 
 @functools.cache
@@ -70,39 +79,116 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_solution[s] = euler_solution_before[s] + euler_direction[s] * step_length[0]
 
     @wp.kernel(module=module, enable_backward=False)
-    def measure(
+    def search(
         nodes: int,
+        rhs: wp.array(dtype=vec3),
+        euler_rhs: wp.array(dtype=scalar),
+        direction: wp.array(dtype=vec3),
+        euler_direction: wp.array(dtype=scalar),
+        slope: wp.array(dtype=scalar),
+        step_length: wp.array(dtype=scalar),
+    ):
+        """Begins a line search along δ: a full step first, and r·δ, how fast r falls along δ."""
+        total = scalar(0.0)
+        for i in range(nodes):
+            total += wp.dot(rhs[i], direction[i])
+            if wp.static(sliding):
+                for s in range(2 * i, 2 * i + 2):
+                    total += euler_rhs[s] * euler_direction[s]
+        slope[0] = total
+        step_length[0] = scalar(1.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def judge(
+        nodes: int,
+        is_free: wp.array(dtype=int),
         inverse_x: wp.array(dtype=vec3),
         inverse_s: wp.array(dtype=scalar),
-        vector: wp.array(dtype=vec3),
-        euler_vector: wp.array(dtype=scalar),
+        rhs: wp.array(dtype=vec3),
+        euler_rhs: wp.array(dtype=scalar),
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
         direction: wp.array(dtype=vec3),
         euler_direction: wp.array(dtype=scalar),
-        norms: wp.array(dtype=scalar),
+        shortest: wp.array(dtype=scalar),
+        newton_tolerance: wp.array(dtype=scalar),
+        # line search, in and out
+        slope: wp.array(dtype=scalar),
+        step_length: wp.array(dtype=scalar),
+        size: wp.array(dtype=scalar),
+        tries: wp.array(dtype=int),
+        # what to do next, and report, out
+        continues: wp.array(dtype=int),
+        solves: wp.array(dtype=int),
+        refreshes: wp.array(dtype=int),
+        newton_iterations: wp.array(dtype=int),
+        residual: wp.array(dtype=scalar),
+        status: wp.array(dtype=int),
     ):
-        """‖r‖ in the norm of A's inverse diagonal, and ‖w‖ in that of its diagonal: both are √(energy); and r·δ."""
-        slope = scalar(0.0)
-        of_vector = scalar(0.0)
+        """Whether Newton's iteration ends at w, goes on from it, or takes back half of the way to it.
+
+        ‖r‖ is in the norm of A's inverse diagonal and ‖w‖ in that of its diagonal: both are √(energy).
+        """
+        turned = scalar(0.0)
+        of_rhs = scalar(0.0)
         of_solution = scalar(0.0)
         for i in range(nodes):
             for k in range(3):
                 inverse = inverse_x[i][k]
                 if inverse > scalar(0.0):
-                    of_vector += inverse * vector[i][k] * vector[i][k]
+                    of_rhs += inverse * rhs[i][k] * rhs[i][k]
                     of_solution += solution[i][k] * solution[i][k] / inverse
-                    slope += vector[i][k] * direction[i][k]
+                    turned += rhs[i][k] * direction[i][k]
+                elif is_free[i] != 0:
+                    # a matrix without bounds: nothing here means anything
+                    of_rhs += scalar(wp.static(float("inf")))
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
                     inverse = inverse_s[s]
                     if inverse > scalar(0.0):
-                        of_vector += inverse * euler_vector[s] * euler_vector[s]
+                        of_rhs += inverse * euler_rhs[s] * euler_rhs[s]
                         of_solution += euler_solution[s] * euler_solution[s] / inverse
-                        slope += euler_vector[s] * euler_direction[s]
-        norms[0] = wp.sqrt(of_vector)
-        norms[1] = wp.sqrt(of_solution)
-        norms[2] = slope
+                        turned += euler_rhs[s] * euler_direction[s]
+        now = wp.sqrt(of_rhs)
+        scale = wp.sqrt(of_solution)
+        before = size[0]
+        first = tries[0] == 0
+        tries[0] = tries[0] + 1
+        continues[0] = 1
+        solves[0] = 1
+        refreshes[0] = 0
+        stalled = tries[0] > wp.static(MOST_TRIES)
+        ordered = bool(True)
+        if wp.static(sliding):
+            ordered = shortest[0] > scalar(0.0)
+            shortest[0] = scalar(wp.static(1.0e30))
+        if first or (ordered and (now < before or turned > scalar(-0.9) * slope[0])):
+            if not first:
+                newton_iterations[0] = newton_iterations[0] + 1
+                # a step that hardly helps: the matrix is of another state
+                if now > scalar(0.1) * before:
+                    refreshes[0] = 1
+            size[0] = now
+            before = now
+            if now <= newton_tolerance[0] * scale:
+                continues[0] = 0
+        else:
+            solves[0] = 0
+            step_length[0] = step_length[0] * scalar(0.5)
+            stalled = stalled or step_length[0] < scalar(wp.static(SHORTEST_STEP))
+        residual[0] = before / scale
+        if status[0] != 0:
+            continues[0] = 0
+        elif not wp.isfinite(before) or not wp.isfinite(scale):
+            continues[0] = 0
+            status[0] = wp.static(NOT_FINITE)
+            status[1] = -1
+        elif stalled and continues[0] != 0:
+            continues[0] = 0
+            # what rounding leaves cannot be taken away
+            if not (before <= scalar(wp.static(ROUNDING[scalar])) * scale):
+                status[0] = wp.static(STALLED)
+                status[1] = -1
 
     @wp.kernel(module=module, enable_backward=False)
     def shortest_segment(
@@ -122,23 +208,32 @@ def define(variant: Variant) -> SimpleNamespace:
     def next_base(
         carried_time: wp.array(dtype=scalar),
         carried_rate: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
+        start: wp.array(dtype=vec3),
         base_position: wp.array(dtype=vec3),
         base_euler: wp.array(dtype=scalar),
         base_velocity: wp.array(dtype=vec3),
         base_euler_velocity: wp.array(dtype=scalar),
     ):
-        """q₀ + t w and v₀ + k (w − v₀): from a stage's base to the next stage's."""
+        """q₀ + t w and v₀ + k (w − v₀): from a stage's base to the next stage's, which starts from the same gain of
+        velocity if asked for one. Sliding rates start from those of the stage before: they have next to no inertia."""
         i = wp.tid()
         w = solution[i]
+        gain = w - base_velocity[i]
+        v0 = base_velocity[i] + gain * carried_rate[0]
         base_position[i] = base_position[i] + w * carried_time[0]
-        base_velocity[i] = base_velocity[i] + (w - base_velocity[i]) * carried_rate[0]
+        base_velocity[i] = v0
+        if start and is_free[i] != 0:
+            start[i] = v0 + gain
         if wp.static(sliding):
             for d in range(2):
                 s = 2 * i + d
-                base_euler[s] = base_euler[s] + euler_solution[s] * carried_time[0]
-                base_euler_velocity[s] += (euler_solution[s] - base_euler_velocity[s]) * carried_rate[0]
+                rate = euler_solution[s]
+                gain_s = rate - base_euler_velocity[s]
+                base_euler[s] = base_euler[s] + rate * carried_time[0]
+                base_euler_velocity[s] += gain_s * carried_rate[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def recall_first_stage(
@@ -168,6 +263,21 @@ def define(variant: Variant) -> SimpleNamespace:
                 s = 2 * i + d
                 moved = frame_euler[2 * k + d] - euler[s] - euler_solution[s] * stage_size[0]
                 euler_first_solution[s] = moved / carried_time[0]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def recall_carried_stage(
+        carried_rate: wp.array(dtype=scalar),
+        velocity: wp.array(dtype=vec3),
+        euler_velocity: wp.array(dtype=scalar),
+        solution: wp.array(dtype=vec3),
+        euler_solution: wp.array(dtype=scalar),
+    ):
+        """w of a stage that was carried to the step's end, from q̇⁺ = q̇ + k (w − q̇)."""
+        i = wp.tid()
+        solution[i] = velocity[i] + (solution[i] - velocity[i]) / carried_rate[0]
+        if wp.static(sliding):
+            for s in range(2 * i, 2 * i + 2):
+                euler_solution[s] = euler_velocity[s] + (euler_solution[s] - euler_velocity[s]) / carried_rate[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def carry_adjoint(
@@ -250,10 +360,12 @@ def define(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         enter_stage=enter_stage,
         correct=correct,
-        measure=measure,
+        search=search,
+        judge=judge,
         shortest_segment=shortest_segment,
         next_base=next_base,
         recall_first_stage=recall_first_stage,
+        recall_carried_stage=recall_carried_stage,
         carry_adjoint=carry_adjoint,
         stage_adjoint_residual=stage_adjoint_residual,
         absorb_stage=absorb_stage,

@@ -46,14 +46,14 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
     def prescribe(
         pin_node: wp.array(dtype=int),
         pin_target: wp.array(dtype=vec3),
-        step_size: wp.array(dtype=scalar),
+        remaining: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         solution: wp.array(dtype=vec3),
     ):
-        """The velocity that brings an exact pin to its target within the step."""
+        """The velocity that brings an exact pin to its target within the step, or what is left of it."""
         e = wp.tid()
         i = pin_node[e]
-        solution[i] = (pin_target[e] - position[i]) / step_size[0]
+        solution[i] = (pin_target[e] - position[i]) / remaining[0]
 
     return SimpleNamespace(right_hand_side=right_hand_side, prescribe=prescribe)
 

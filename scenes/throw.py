@@ -38,6 +38,9 @@ PUSHED = 5
 
 HALVINGS = 20
 """How often a throw that cannot be simulated is moved half the way back before the search gives up."""
+METHOD = "linear"
+"""Eq. 2: where momentum decides, not stiffness, one linear solve a step is enough, and the violent forces that a search
+tries need no more."""
 
 
 class Throw:
@@ -68,7 +71,9 @@ class Throw:
         zero = np.zeros((PUSHED, 3))
         pushed = {node: zero for node in cloth.corners()} if forces else None
         self.scene = wy.Scene(cloth, gravity=GRAVITY, forces=pushed)
-        self.rollout = wt.Rollout(self.scene, self.steps, frames=[self.steps], step=self.step, **options)
+        self.rollout = wt.Rollout(
+            self.scene, self.steps, frames=[self.steps], step=self.step, integrator=METHOD, **options
+        )
         speed = self.distance / self.duration
         # An impulse of `scale` on each of so many variables moves the centre as one of √count times that on one.
         self.scale = mass(cloth) * speed / (self.step * np.sqrt(PUSHED * 4)) if forces else speed
@@ -99,7 +104,9 @@ class Throw:
         value, cloth = self.physical(y).detach().numpy(), self.cloth
         corners = cloth.corners()
         forces = {node: value[:, k] for k, node in enumerate(corners)} if self.forces else None
-        simulator = wy.Simulator(wy.Scene(cloth, gravity=GRAVITY, forces=forces), step=self.step)
+        scene = wy.Scene(cloth, gravity=GRAVITY, forces=forces)
+        tolerance = self.rollout.simulator.model.tolerance
+        simulator = wy.Simulator(scene, step=self.step, integrator=METHOD, tolerance=tolerance)
         if not self.forces:
             velocity = np.broadcast_to(value, (cloth.nodes, 3))
             simulator.state = dataclasses.replace(simulator.state, velocity=velocity)
@@ -171,7 +178,7 @@ def search(throw: Throw, iterations: int, rate: float, within: float) -> Search:
                 before = y.detach().clone()
                 try:
                     optimizer.step(closure)
-                except wy.SimulationError:
+                except (wy.SimulationError, wy.GradientError):
                     halvings += 1
                     if halvings > HALVINGS or not found.losses:
                         raise
@@ -184,7 +191,7 @@ def search(throw: Throw, iterations: int, rate: float, within: float) -> Search:
                 bar.set_postfix(loss=f"{found.losses[-1]:.2e}", mm=f"{1e3 * found.distances[-1]:.4f}")
                 if min(found.distances) <= within:
                     break
-    except (wy.SimulationError, KeyboardInterrupt) as error:
+    except (wy.SimulationError, wy.GradientError, KeyboardInterrupt) as error:
         found.stop = error
     return found
 

@@ -63,7 +63,7 @@ def scene(name: str, terms: tuple[str, ...] | None, sliding: bool = True, publis
 def simulator(
     name: str, terms: tuple[str, ...] | None, sliding: bool = True, published_scaling: bool = False
 ) -> wy.Simulator:
-    return wy.Simulator(scene(name, terms, sliding, published_scaling))
+    return wy.Simulator(scene(name, terms, sliding, published_scaling), integrator="linear")
 
 
 @functools.cache

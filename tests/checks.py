@@ -69,13 +69,7 @@ def matrix(
     sim: wy.Simulator, state: wy.State, *, mass: float = 0.0, damping: float = 0.0, stiffness: float = 0.0
 ) -> np.ndarray:
     """mass · M + damping · D + stiffness · H, as the scene's terms write them."""
-    weights = sim.arrays["weights"]
-    before = weights.numpy().copy()
-    weights.assign(np.array([[mass, damping, stiffness]]))
-    try:
-        return sim.system(state).dense()
-    finally:
-        weights.assign(before)
+    return sim.system(state, weights=(mass, damping, stiffness)).dense()
 
 
 def check_definite(a: np.ndarray) -> None:

@@ -97,7 +97,7 @@ def gradcheck(function: Callable, inputs: list[torch.Tensor]) -> bool:
 @pytest.mark.parametrize("steps", [1, 5])
 @pytest.mark.parametrize("group", GROUPS)
 def test_gradcheck(group: str, steps: int) -> None:
-    rollout = wt.Rollout(scene_for(group, steps), steps, frames=[steps], tolerance=EXACT)
+    rollout = wt.Rollout(scene_for(group, steps), steps, frames=[steps], integrator="linear", tolerance=EXACT)
     fixed = jittered(rollout.scene.cloth)
     if group == "initial state":
         del fixed["anchor"]
@@ -106,13 +106,15 @@ def test_gradcheck(group: str, steps: int) -> None:
 
 @pytest.mark.parametrize("steps", [1, 5])
 def test_gradcheck_exact_pins(steps: int) -> None:
-    rollout = wt.Rollout(scene_for("exact pins", steps, stiffness=None), steps, frames=[steps], tolerance=EXACT)
+    rollout = wt.Rollout(
+        scene_for("exact pins", steps, stiffness=None), steps, frames=[steps], integrator="linear", tolerance=EXACT
+    )
     function, inputs = scaled(rollout, ("pin_path", "stretch", "position"), jittered(rollout.scene.cloth))
     assert gradcheck(function, inputs)
 
 
 def test_gradcheck_locked() -> None:
-    rollout = wt.Rollout(scene_for("locked", 3, sliding=False), 3, frames=[3], tolerance=EXACT)
+    rollout = wt.Rollout(scene_for("locked", 3, sliding=False), 3, frames=[3], integrator="linear", tolerance=EXACT)
     fixed = jittered(rollout.scene.cloth, sliding=False)
     names = ("density", "stretch", "bend", "shear", "wind_velocity", "position", "velocity", "euler")
     function, inputs = scaled(rollout, names, fixed)
@@ -134,11 +136,11 @@ def richardson(function: Callable[[float], float], x: float, scale: float) -> tu
     return best
 
 
-def hung(friction: float, friction_damping: float) -> tuple[wt.Rollout, dict[str, torch.Tensor]]:
-    """The hung 6 × 6 twill of 50 steps, and every number of it."""
+def hung(friction: float, friction_damping: float, steps: int = 50) -> tuple[wt.Rollout, dict[str, torch.Tensor]]:
+    """The hung 6 × 6 twill, and every number of it."""
     fabric = cloth(6, 6, "twill", friction=friction, friction_damping=friction_damping)
     scene = wy.Scene(fabric, wind=wy.Wind(velocity=(0.0, 5.0, 0.0)), pins=fabric.corners("top"))
-    rollout = wt.Rollout(scene, 50, tolerance=EXACT)
+    rollout = wt.Rollout(scene, steps, integrator="linear", tolerance=EXACT)
     values = {name: rollout.defaults[name] for name in (*wt.NUMBERS, *wt.VECTORS)}
     for name in ("density", "stretch", "bend"):
         values[name] = torch.tensor([getattr(yarn, name) for yarn in YARNS], dtype=torch.float64)
@@ -151,10 +153,11 @@ OF_SLIDING = ("friction", "friction_stiffness", "friction_damping", "friction_sh
 @pytest.mark.parametrize("slippery", [False, True], ids=["the paper's cloth", "a slippery cloth"])
 def test_every_parameter_of_the_hung_cloth(slippery: bool) -> None:
     # On the paper's cloth sliding moves positions by less than differences can resolve, so what rules sliding is
-    # differentiated where yarns slide farther, and the rest where no crossing passes friction's kinks.
-    rollout, values = hung(0.5, 0.1) if slippery else hung(0.5, 1000.0)
+    # differentiated where yarns slide farther, and the rest where no crossing passes friction's kinks. After more than
+    # 30 steps the slippery one passes them, and differences by friction agree with themselves to 1e-4 only.
+    rollout, values = hung(0.5, 0.1, 30) if slippery else hung(0.5, 1000.0)
     names = [name for name in values if (name in OF_SLIDING) == slippery]
-    weights = torch.randn(51, 36, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    weights = torch.randn(rollout.steps + 1, 36, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     rest = torch.tensor(rollout.scene.cloth.position)
 
     def loss(inputs: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -197,9 +200,8 @@ def test_gradient_error_follows_the_solver_tolerance() -> None:
 def test_state_of_rest_has_finite_and_right_gradients(at_limit: bool) -> None:
     fabric = cloth(5, 5, pose="flat", friction_damping=0.1)
     still = wy.Wind(velocity=(0.0, 0.0, 0.0))
-    rollout = wt.Rollout(
-        wy.Scene(fabric, gravity=None, wind=still, pins=fabric.corners()), 3, frames=[3], tolerance=EXACT
-    )
+    scene = wy.Scene(fabric, gravity=None, wind=still, pins=fabric.corners())
+    rollout = wt.Rollout(scene, 3, frames=[3], integrator="linear", tolerance=EXACT)
     fixed = {}
     if at_limit:
         # k_f |δ| = μF_n, from the force with which bent yarns press on each other
@@ -251,8 +253,9 @@ def test_chosen_frames_are_those_of_the_whole_run(every: int) -> None:
 
 def test_run_is_the_simulator_s() -> None:
     scene = scene_for("forces", 5)
-    frames = wt.Rollout(scene, 70)()
-    trajectory = wy.Simulator(scene).run(70)
+    tolerances = {"tolerance": 1e-8, "newton_tolerance": 1e-8}
+    frames = wt.Rollout(scene, 70, **tolerances)()
+    trajectory = wy.Simulator(scene, **tolerances).run(70)
     assert np.array_equal(frames.position.numpy(), trajectory.position)
     assert np.array_equal(frames.euler.numpy(), trajectory.euler)
 
@@ -366,7 +369,7 @@ def test_bad_fabric(options: dict, message: str) -> None:
 def test_forward_failure_raises_the_forward_error() -> None:
     rollout = wt.Rollout(scene_for("plain", 3), 3)
     state = jittered(rollout.scene.cloth)
-    state["velocity"] = state["velocity"] * 1e200
+    state["velocity"] = state["velocity"] * 1e300
     with pytest.raises(wy.SimulationError, match="step 1"):
         rollout(**state)
     # and the rollout is still good for another call

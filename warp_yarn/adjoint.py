@@ -73,10 +73,11 @@ class Adjoint:
         """
         a = self.arrays
         a["counters"].assign(np.array([steps, first + steps], dtype=np.int32))
-        for k in range(steps, 0, -1):
-            self.simulator.integrator.retreat()
-            if a["status"].numpy()[0]:
-                self._fail(first + k)
+        with self.simulator.model.team():
+            for k in range(steps, 0, -1):
+                self.simulator.integrator.retreat()
+                if a["status"].numpy()[0]:
+                    self._fail(first + k)
 
     def finish(self) -> None:
         """Takes in what the loss asks of the first frame; the running adjoints are then those of the initial state."""

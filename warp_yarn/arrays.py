@@ -145,6 +145,7 @@ class Arrays(dict[str, Any]):
         self["residual"] = self.zeros(1, scalar)
         self["weights"] = self.zeros(1, vec3)
         self["step_size"] = self.zeros(1, scalar)
+        self["remaining"] = self.zeros(1, scalar)
 
     def zero(self, *names: str) -> None:
         """Sets arrays to 0, those that the scene has."""

@@ -5,6 +5,10 @@ What a time step is made of, without saying how: that is for ``integrators``.
 
 from __future__ import annotations
 
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,22 +27,32 @@ BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
+NARROWEST_STRIP = 8
+"""Columns; the sweeps need 3 at least, and fewer than these do not pay."""
+SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
+"""What differs from one linear solve to another."""
 PRECONDITIONERS = ("incomplete", "jacobi")
 PRECISIONS = {"double": wp.float64, "single": wp.float32}
-TOLERANCES = {"double": 1e-8, "single": 1e-4}
-NEWTON = {"double": 1e-6, "single": 1e-4}
+TOLERANCES = {"double": 1e-6, "single": 1e-4}
+"""Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
+NEWTON_TOLERANCE = 3e-4
+"""Adds less than a tenth to the error of the second-order methods at steps of 1/4 to 2 ms of the paper's cloth
+(``benchmarks/work_precision.py``)."""
+EXACT = 1e-8
+"""Both tolerances of differentiable runs in double precision: gradients are right to no more digits than these."""
 
 
 class Model:
     """A scene on the device.
 
     Args:
-        scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations,
+        scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations, threads,
             differentiable: as of the Simulator.
 
     Attributes:
         arrays: by the names that kernels use.
         kernels: by name.
+        strips: of the cloth, one a processor core that a linear solve takes.
         held: whether pins are exact.
     """
 
@@ -53,6 +67,7 @@ class Model:
         tolerance: float | None,
         newton_tolerance: float | None,
         max_iterations: int | None,
+        threads: int,
         differentiable: bool,
     ):
         if not isinstance(scene, Scene):
@@ -61,9 +76,12 @@ class Model:
         self.step_size = number("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
-        self.tolerance = TOLERANCES[precision] if tolerance is None else number("tolerance", tolerance, above=0.0)
+        exact = differentiable and precision == "double"
+        default = EXACT if exact else TOLERANCES[precision]
+        self.tolerance = number("tolerance", default if tolerance is None else tolerance, above=0.0)
+        default = EXACT if exact else NEWTON_TOLERANCE
         self.newton_tolerance = number(
-            "newton_tolerance", NEWTON[precision] if newton_tolerance is None else newton_tolerance, above=0.0
+            "newton_tolerance", default if newton_tolerance is None else newton_tolerance, above=0.0
         )
         degrees = scene.cloth.nodes * (5 if scene.sliding else 3)
         most = max(1000, degrees) if max_iterations is None else max_iterations
@@ -76,13 +94,49 @@ class Model:
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
         self.arrays = Arrays(scene, variant, self.device)
-        self.arrays["step_size"].assign(np.array([self.step_size]))
-        self.set_weights(1.0, self.step_size, self.step_size**2)
+        self.set_times(self.step_size, self.step_size)
+        self.arrays["tolerance"] = self.arrays.numbers(self.tolerance)
+        self._form_team(whole("threads", threads, least=1))
         self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
 
-    def set_weights(self, mass: float, damping: float, stiffness: float) -> None:
-        """The factors of M, D and H in the matrix: 1, h and h² for eq. 2."""
-        self.arrays["weights"].assign(np.array([[mass, damping, stiffness]]))
+    def _form_team(self, threads: int) -> None:
+        """Strips of the cloth for so many processor cores (``kernels/incomplete.py``)."""
+        a = self.arrays
+        if threads > 1 and not (self.device.is_cpu and self.preconditioner == "incomplete"):
+            raise InputError(
+                f"threads = {threads}, must be 1 on {self.device} with the {self.preconditioner!r} preconditioner: "
+                "only the CPU's 'incomplete' one shares its work"
+            )
+        columns = self.scene.cloth.weave.columns
+        self.strips = max(1, min(threads, columns // NARROWEST_STRIP))
+        a["columns"] = columns
+        a["sums"] = a.zeros(5 * self.strips, a.variant.scalar)
+        a["team"] = a.zeros(16 + 16 * self.strips, wp.int32)
+        self._team_of(1)
+        if self.strips > 1:
+            for name in SOLVED:
+                a[f"team_{name}"] = None if a[name] is None else a.zeros(a[name].shape[0], a[name].dtype)
+
+    def _team_of(self, strips: int) -> None:
+        """Begins to count anew, for so many strips."""
+        team = self.arrays["team"]
+        team.assign(np.where(np.arange(len(team)) == 3, strips, 0).astype(np.int32))
+
+    def set_times(self, step: float, remaining: float) -> None:
+        """The step that kernels make, with eq. 2's factors of M, D and H in the matrix: 1, h and h².
+
+        Args:
+            step: h [s].
+            remaining: time in which exact pins reach their targets [s]; more than h in a part of a step.
+        """
+        a = self.arrays
+        a["step_size"].assign(np.array([step]))
+        a["remaining"].assign(np.array([remaining]))
+        self.set_weights(step)
+
+    def set_weights(self, size: float) -> None:
+        """The factors of M, D and H in the matrix of an implicit step of this size [s]."""
+        self.arrays["weights"].assign(np.array([[1.0, size, size * size]]))
 
     def launch(self, kernel: str, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel by its name (see ``Arrays.launch``)."""
@@ -123,13 +177,54 @@ class Model:
         if self.held:
             self.launch("prescribe", "pins", **replaced)
 
-    def solve(self, **replaced: Any) -> None:
-        """The conjugate gradient on the assembled matrix, with other vectors or numbers where they are given."""
+    def factorize(self) -> None:
+        """The preconditioner of the assembled matrix."""
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
-        numbers = {"tolerance": self.tolerance, "most_iterations": self.max_iterations}
-        self.launch(f"{self.preconditioner}_conjugate_gradient", 1, **{**numbers, **replaced})
+
+    def solve(self, **replaced: Any) -> None:
+        """The conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
+        a = self.arrays
+        arrays = {name: replaced.get(name, a[name]) for name in SOLVED}
+        kernel = f"{self.preconditioner}_conjugate_gradient"
+        if self.strips == 1:
+            self.launch(kernel, 1, strip=0, most_iterations=self.max_iterations, **arrays)
+            return
+        # helpers were launched with arrays of their own
+        for name, array in arrays.items():
+            if array is not None:
+                wp.copy(a[f"team_{name}"], array)
+        self._launch_solve(0)
+        for name in ("solution", "euler_solution"):
+            if arrays[name] is not None:
+                wp.copy(arrays[name], a[f"team_{name}"])
+
+    def _launch_solve(self, strip: int) -> None:
+        arrays = {name: self.arrays[f"team_{name}"] for name in SOLVED}
+        self.launch("incomplete_conjugate_gradient", 1, strip=strip, most_iterations=self.max_iterations, **arrays)
+
+    @contextlib.contextmanager
+    def team(self) -> Iterator[None]:
+        """Keeps the other processor cores at hand for linear solves, for as long as a block lasts."""
+        if self.strips == 1:
+            yield
+            return
+        self._team_of(self.strips)
+        team = self.arrays["team"].numpy()  # on the CPU the array itself
+        helpers = []
+        try:
+            for strip in range(1, self.strips):
+                helpers.append(threading.Thread(target=self._launch_solve, args=(strip,), daemon=True))
+                helpers[-1].start()
+                while team[4] != strip and helpers[-1].is_alive():
+                    time.sleep(1e-5)
+            yield
+        finally:
+            team[2] = 1
+            for helper in helpers:
+                helper.join()
+            self._team_of(1)
 
     def drag_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""

@@ -18,6 +18,8 @@ from .system import System, gather
 
 CHUNK_BYTES = 1 << 24
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
+SMALLEST_PART = 2.0**-10
+"""Of a step: one that cannot be made is split in two, and its halves again, down to this."""
 
 
 class Simulator:
@@ -26,23 +28,27 @@ class Simulator:
     Args:
         scene: the scene.
         step: h, time step [s], above 0.
-        integrator: the method: "linear" (eq. 2 of the paper, order 1), "implicit-euler" (order 1, one implicit stage a
-            step) or "sdirk2" (order 2, two implicit stages); see ``warp_yarn/integrators``.
+        integrator: the method, by its name: "sdirk2" (order 2, strongly damped), "linear" (eq. 2 of the paper, order
+            1), "implicit-euler" (order 1) or "implicit-midpoint" (order 2, undamped); see ``warp_yarn/integrators``.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
         preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (``kernels/incomplete.py``,
             ``kernels/solver.py``).
-        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-8, in
-            single precision 1e-4. Within an implicit stage it is that of the adjoint's solves alone.
-        newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms; None: 1e-6, in
-            single precision 1e-4.
+        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-6,
+            and 1e-8 where differentiable; in single precision 1e-4. In implicit stages it is that of the adjoint's
+            solves alone.
+        newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms; None: 3e-4,
+            and 1e-8 where differentiable; in single precision 3e-4.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
+        threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
+            are free. They pay on large cloths (``benchmarks/bandwidth.py``).
         chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
         differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
 
     Attributes:
         state: the present state; set it to start from another one.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up.
+        split_steps: which of the steps since the beginning could only be made in parts, and the smallest of these [s].
         arrays: the scene's arrays on the device, by the names that kernels use.
     """
 
@@ -51,13 +57,14 @@ class Simulator:
         scene: Scene,
         *,
         step: float = 1e-3,
-        integrator: str = "linear",
+        integrator: str = "sdirk2",
         device: Any = "cpu",
         precision: str = "double",
         preconditioner: str = "incomplete",
         tolerance: float | None = None,
         newton_tolerance: float | None = None,
         max_iterations: int | None = None,
+        threads: int = 1,
         chunk: int | None = None,
         differentiable: bool = False,
     ):
@@ -71,11 +78,13 @@ class Simulator:
             tolerance=tolerance,
             newton_tolerance=newton_tolerance,
             max_iterations=max_iterations,
+            threads=threads,
             differentiable=differentiable,
         )
         self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
         self.integrator = method(self.model)
         self.steps_done = 0
+        self.split_steps: dict[int, float] = {}
         fitting = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
         self.chunk = fitting if chunk is None else whole("chunk", chunk, least=1)
         self.arrays.add_frames(self.chunk + 1)
@@ -139,17 +148,61 @@ class Simulator:
         Returns:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
-        self.arrays["counters"].assign(np.array([0, self.steps_done], dtype=np.int32))
+        self._count(0)
         self.model.launch("record", "nodes")
+        made = 0
+        with self.model.team():
+            while made < steps:
+                made += self._advance(steps - made)
+                if made < steps and not self._make_in_parts(made):
+                    break
+                made = min(made + 1, steps)
+        self.steps_done += made
+        return made
+
+    def _count(self, frame: int) -> None:
+        """Tells the device which frame of the chunk the present state is."""
+        self.arrays["counters"].assign(np.array([frame, self.steps_done + frame], dtype=np.int32))
+
+    def _advance(self, steps: int) -> int:
+        """Makes steps until one fails; how many were made."""
         status = self.arrays["status"].numpy() if self.model.device.is_cpu else np.zeros(1)
+        first = int(self.arrays["counters"].numpy()[0])
         for _ in range(steps):
             self.integrator.advance()
             if status[0]:  # on the CPU the array itself; elsewhere looking would wait for every step
                 break
         status = self.arrays["status"].numpy()
-        made = int(status[2]) - 1 if status[0] else steps
-        self.steps_done += made
+        return int(status[2]) - 1 - first if status[0] else steps
+
+    def _make_in_parts(self, frame: int) -> bool:
+        """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
+        self._parts: list[float] = []
+        self._upload(self._frame(frame))
+        made = all(self._part(frame, 0.5 * k, 0.5) for k in range(2))
+        self.integrator.set_times(self.step_size, self.step_size)
+        if made:
+            self.split_steps[self.steps_done + frame + 1] = min(self._parts) * self.step_size
+            self._count(frame + 1)
+        else:
+            self.arrays["status"].assign(self._failed)
         return made
+
+    def _part(self, frame: int, done: float, size: float) -> bool:
+        """Makes a part of a step, of which so much is done, or its two halves."""
+        before, step = self.state, self.step_size
+        self._count(frame)
+        self.arrays.zero("status")
+        self.integrator.set_times(size * step, (1.0 - done) * step)
+        self.integrator.advance()
+        self._failed = self.arrays["status"].numpy().copy()
+        self.arrays.zero("status")
+        if not self._failed[0]:
+            self._parts.append(size)
+            return True
+        self._upload(before)
+        half = 0.5 * size
+        return half >= SMALLEST_PART and self._part(frame, done, half) and self._part(frame, done + half, half)
 
     def run(self, steps: int, *, progress: bool = False) -> Trajectory:
         """Makes steps and returns every frame, the present one first.
@@ -184,6 +237,10 @@ class Simulator:
             if self.moves(name):
                 kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
                 getattr(trajectory, name)[at : at + count] = kept[:count]
+
+    def _frame(self, k: int) -> State:
+        """A frame of the chunk on the device."""
+        return self.chunk_trajectory(k + 1)[k]
 
     def chunk_trajectory(self, frames: int) -> Trajectory:
         """The first frames of the chunk that the device holds."""
@@ -222,7 +279,7 @@ class Simulator:
         }[code]
         raise SimulationError(
             f"{where} {what}. The largest term {'there ' if node >= 0 else ''}is {term!r}. "
-            f"Try a smaller step than {self.step_size:g} s; "
+            f"It was tried in parts as small as {SMALLEST_PART * self.step_size:.1e} s; "
             f"the {len(trajectory)} frames before are in this error's trajectory",
             step=k,
             node=node,
@@ -292,11 +349,20 @@ class Simulator:
                     result[term.name] = float(energy.numpy()[0])
         return result
 
-    def system(self, state: State | None = None) -> System:
-        """The linear system of the next step of eq. 2, to look into."""
+    def system(self, state: State | None = None, weights: tuple[float, float, float] | None = None) -> System:
+        """The linear system of the next step of eq. 2, to look into.
+
+        Args:
+            state: of the step's beginning; None: the present one.
+            weights: factors of M, D and H in its matrix; None: 1, h and h².
+        """
+        h = self.step_size
         with _Visit(self, state):
+            self.arrays["weights"].assign(np.array([weights or (1.0, h, h * h)]))
             self.model.assemble()
-            return gather(self.model)
+            system = gather(self.model)
+        self.integrator.set_times(h, h)
+        return system
 
 
 class _Visit:

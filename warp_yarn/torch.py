@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from .adjoint import FRAMES, Adjoint
 from .arrays import STATE_TYPES, YARN_PARAMETERS
-from .errors import InputError, whole
+from .errors import GradientError, InputError, whole
 from .scene import Scene
 from .simulator import Simulator
 from .state import FIELDS, State
@@ -171,6 +171,7 @@ class Rollout:
             _flat(target)[: value.numel()].copy_(value.reshape(-1))
         self.simulator.state = State(*(given[name].cpu().numpy() for name in FIELDS))
         self.simulator.steps_done = 0
+        self.simulator.split_steps = {}
 
     def _store(self, kept: Mapping[str, torch.Tensor], first: int, count: int, at: int) -> None:
         """Copies frames first... of the chunk on the device to frames at... of the kept ones."""
@@ -301,6 +302,7 @@ class _Run(torch.autograd.Function):
         values = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
         frames, kept = rollout.run(values)
         ctx.rollout, ctx.names, ctx.kept_names = rollout, names, tuple(kept)
+        ctx.split = dict(rollout.simulator.split_steps)
         ctx.save_for_backward(*tensors, *kept.values())
         ctx.set_materialize_grads(False)
         return tuple(frames[name] for name in FRAMES)
@@ -308,6 +310,13 @@ class _Run(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        for k, part in ctx.split.items():
+            raise GradientError(
+                f"step {k} could only be made in parts, the smallest {part:g} s, and has no gradient; "
+                f"try a smaller step than {ctx.rollout.simulator.step_size:g} s",
+                step=k,
+                term=None,
+            )
         names, saved = ctx.names, ctx.saved_tensors
         values = dict(zip(names, saved[: len(names)], strict=True))
         kept = dict(zip(ctx.kept_names, saved[len(names) :], strict=True))

@@ -13,4 +13,5 @@ class ImplicitEuler(StageMethod):
     name = "implicit-euler"
     order = 1
     fraction = 1.0
+    carried = 0.0
     stages = 1

@@ -25,6 +25,10 @@ class LinearlyImplicitEuler:
         self._forward: Any = None
         self._backward: Any = None
 
+    def set_times(self, step: float, remaining: float) -> None:
+        """As of Model.set_times."""
+        self.model.set_times(step, remaining)
+
     def advance(self) -> None:
         """Makes a step, and records it. Captured at the first call: replayed, its twenty launches cost microseconds."""
         if self._forward is None:
@@ -42,6 +46,7 @@ class LinearlyImplicitEuler:
         if model.scene.sliding:
             wp.copy(a["euler_solution"], a["euler_velocity"])
         model.prescribe()
+        model.factorize()
         model.solve()
         model.launch("advance", "nodes")
         model.end_step()
@@ -104,6 +109,7 @@ class LinearlyImplicitEuler:
         """λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
         model, a = self.model, self.model.arrays
         model.launch("adjoint_right_hand_side", "nodes")
+        model.factorize()
         multiplier = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
         model.solve(rhs=a["seed"], euler_rhs=a["euler_seed"], **multiplier)
         if model.held:

@@ -11,11 +11,10 @@ class SDIRK2(StageMethod):
 
     Order 2; less where stiff springs go unresolved. L-stable and stiffly accurate: unresolved stiff modes and the stiff
     damping of sliding, whose mass is singular, vanish within a step as with implicit Euler, at a fraction of its error.
-    Implicit midpoint, also of order 2, was tried and left out: it damps nothing, and its Newton iteration stalls once
-    yarns buckle.
     """
 
     name = "sdirk2"
     order = 2
     fraction = 1.0 - 0.5**0.5
+    carried = 0.5**0.5
     stages = 2

@@ -14,18 +14,11 @@ from ..model import BETWEEN, Model
 MOVED = ("position", "euler", "velocity", "euler_velocity", "increment", "euler_increment")
 """Arrays of the stage that w moves."""
 
-FORWARD = ("_begin", "_evaluate", "_solve_direction", "_correct", "_next_base", "end_step")
-"""Parts of a step whose graphs hold nothing of adjoints."""
-INNER_TOLERANCE = 1e-3
+INNER_TOLERANCE = 1e-2
 """Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
 would not come nearer to the stage's."""
-MOST_ITERATIONS = 200
-"""Of Newton's iteration, which takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so that violent
-sliding brings them to dozens."""
 MOST_PARTS = 100
 """Of GMRES, each kept as a vector."""
-SHORTEST_STEP = 1.0 / 64.0
-"""Of the line search."""
 
 
 def _values(array: wp.array) -> wp.array:
@@ -34,12 +27,13 @@ def _values(array: wp.array) -> wp.array:
 
 
 class StageMethod:
-    """A method whose step is one or two implicit stages of size η = fraction · h, the last of which ends it.
+    """A method whose step is one or two implicit stages of size η = fraction · h.
 
-    The first stage starts from the present state (q, q̇); a second one, of SDIRK type, from q + (h − η) w₁ and
-    q̇ + (h − η) (w₁ − q̇)/η.
+    The first stage starts from the present state (q, q̇). What it leads to is carried by t = carried · h, to
+    q + t w₁ and q̇ + t (w₁ − q̇)/η: there a second stage starts, or the step ends if there is none. Where carried is 0
+    the stage itself ends the step, and so does a second stage.
 
-    Newton's iteration ends where ‖r‖ ≤ newton_tolerance · ‖w‖, in the norms of ``measure``. Along δ it takes a full
+    Newton's iteration ends where ‖r‖ ≤ newton_tolerance · ‖w‖, in the norms of ``judge``. Along δ it takes a full
     step unless that overshoots: r·δ is minus the slope of the energy that a stage minimizes, where there is one, and
     must not turn to more than 0.9 of itself with the other sign, or else ‖r‖ must fall. (That it always falls is too
     much to ask of yarns that buckle.) Nor may crossings change their order.
@@ -48,12 +42,12 @@ class StageMethod:
     name: str
     order: int
     fraction: float
+    carried: float
     stages: int
 
     def __init__(self, model: Model):
         self.model = model
-        a, h = model.arrays, model.step_size
-        eta = self.fraction * h
+        a = model.arrays
         vec3, scalar, n = a.variant.vec3, a.variant.scalar, a["nodes"]
         sliding = model.scene.sliding
         for name in ("base_position", "base_velocity", "increment", "direction", "solution_before"):
@@ -61,14 +55,30 @@ class StageMethod:
         for name in ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before"):
             a[name] = a.zeros(2 * n, scalar) if sliding else None
         a["base_euler"] = a.zeros(2 * n, scalar)
-        a["norms"] = a.zeros(3, scalar)
-        numbers = {"stage_size": eta, "carried_time": h - eta, "carried_rate": (h - eta) / eta}
-        for name, value in {**numbers, "unit": 1.0, "step_length": 1.0, "shortest": 1.0}.items():
+        for name in ("size", "slope"):
+            a[name] = a.zeros(1, scalar)
+        for name in ("tries", "continues", "solves", "refreshes", "newton_iterations"):
+            a[name] = a.zeros(1, wp.int32)
+        for name in ("stage_size", "carried_time"):
+            a[name] = a.zeros(1, scalar)
+        rate = self.carried / self.fraction
+        numbers = {"carried_rate": rate, "unit": 1.0, "step_length": 1.0, "shortest": 1e30}
+        for name, value in {
+            **numbers,
+            "newton_tolerance": model.newton_tolerance,
+            "inner_tolerance": INNER_TOLERANCE,
+        }.items():
             a[name] = a.numbers(value)
-        model.set_weights(1.0, eta, eta * eta)
-        self.iterations = 0
-        """Newton iterations of the last step."""
+        self.set_times(model.step_size, model.step_size)
         self._graphs: dict[str, Any] = {}
+
+    def set_times(self, step: float, remaining: float) -> None:
+        """As of Model.set_times."""
+        a, eta = self.model.arrays, self.fraction * step
+        self.model.set_times(step, remaining)
+        self.model.set_weights(eta)
+        a["stage_size"].assign(np.array([eta]))
+        a["carried_time"].assign(np.array([self.carried * step]))
 
     # -- graphs ------------------------------------------------------------------------------------------------------
 
@@ -91,22 +101,41 @@ class StageMethod:
     # -- forward -----------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
-        """Makes a step, and records it."""
-        self.iterations = 0
-        self._run(self._begin)
+        """Makes a step, and records it: one captured graph, whose loops end on the device."""
+        self._run(self._step)
+
+    def _step(self) -> None:
+        model = self.model
+        self._begin()
         for stage in range(self.stages):
             if stage:
-                self._run(self._next_base)
-            self._newton()
-        self._run(self.model.end_step)
+                model.launch("next_base", "nodes", start=model.arrays["solution"])
+            self._newton(fresh=stage == 0)
+        if self._is_carried:
+            model.launch("next_base", "nodes", start=None)
+            self._copy(
+                position="base_position",
+                euler="base_euler",
+                velocity="base_velocity",
+                euler_velocity="base_euler_velocity",
+            )
+        model.end_step()
 
-    def _next_base(self) -> None:
-        self.model.launch("next_base", "nodes")
+    @property
+    def _is_carried(self) -> bool:
+        """Whether what the only stage leads to is carried to the step's end."""
+        return self.stages == 1 and self.carried > 0.0
+
+    @property
+    def iterations(self) -> int:
+        """Newton iterations of the last step."""
+        return int(self.model.arrays["newton_iterations"].numpy()[0])
 
     def _begin(self) -> None:
         """The stage starts from the present state, at the present velocity."""
         model = self.model
         model.take_inputs()
+        model.arrays.zero("newton_iterations")
         self._copy(solution="velocity", euler_solution="euler_velocity")
         model.prescribe()
         self._set_base()
@@ -119,65 +148,50 @@ class StageMethod:
             base_euler_velocity="euler_velocity",
         )
 
-    def _evaluate(self) -> None:
-        """The residual and the matrix at w, and how large the residual is."""
-        model, a = self.model, self.model.arrays
-        model.launch("enter_stage", "nodes")
-        self._assemble(matrix=True)
-        model.launch("precondition", "nodes")
-        model.launch("measure", 1, vector=a["rhs"], euler_vector=a["euler_rhs"])
-        if model.scene.sliding:
-            a["shortest"].fill_(np.inf)
-            model.launch("shortest_segment", "segments")
+    def _evaluate(self, *, matrix: bool) -> None:
+        """The residual at w, and the matrix if asked for."""
+        self.model.launch("enter_stage", "nodes")
+        self._assemble(matrix=matrix)
+        if matrix:
+            self.model.factorize()
 
     def _assemble(self, *, matrix: bool) -> None:
         a = self.model.arrays
         mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
         self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
 
+    def _newton(self, *, fresh: bool) -> None:
+        """Solves the stage. Its matrix is that of the step's first stage until convergence is slow: another state's
+        differs less from it than it differs from the exact derivative."""
+        a = self.model.arrays
+        a.zero("tries", "direction", "euler_direction")
+        self._evaluate(matrix=fresh)
+        self._judge()
+        wp.capture_while(a["continues"], self._iterate)
+
+    def _judge(self) -> None:
+        if self.model.scene.sliding:
+            self.model.launch("shortest_segment", "segments")
+        self.model.launch("judge", 1)
+
+    def _iterate(self) -> None:
+        a = self.model.arrays
+        wp.capture_if(a["refreshes"], on_true=self._refresh)
+        wp.capture_if(a["solves"], on_true=self._solve_direction)
+        self.model.launch("correct", "nodes")
+        self._evaluate(matrix=False)
+        self._judge()
+
+    def _refresh(self) -> None:
+        self._evaluate(matrix=True)
+
     def _solve_direction(self) -> None:
         """δ, from A δ = r."""
         a = self.model.arrays
         a.zero("direction", "euler_direction")
         self._copy(solution_before="solution", euler_solution_before="euler_solution")
-        self.model.solve(tolerance=INNER_TOLERANCE, solution=a["direction"], euler_solution=a["euler_direction"])
-
-    def _correct(self) -> None:
-        self.model.launch("correct", "nodes")
-        self._evaluate()
-
-    def _newton(self) -> None:
-        a = self.model.arrays
-        self._run(self._evaluate)
-        size, scale, _ = a["norms"].numpy()
-        for _ in range(MOST_ITERATIONS):
-            if size <= self.model.newton_tolerance * scale or not np.isfinite(size):
-                break
-            self._run(self._solve_direction)
-            slope, length = self._slope(), 1.0
-            while length >= SHORTEST_STEP:
-                a["step_length"].fill_(length)
-                self._run(self._correct)
-                next_size, scale, next_slope = a["norms"].numpy()
-                falls = next_size < size or next_slope > -0.9 * slope
-                if falls and a["shortest"].numpy()[0] > 0.0:
-                    break
-                length *= 0.5
-            else:
-                break
-            size = next_size
-            self.iterations += 1
-        # what rounding leaves cannot be taken away
-        if not size <= max(self.model.newton_tolerance, 1e4 * self._rounding) * scale:
-            self._stall(size / scale)
-
-    def _slope(self) -> float:
-        """r·δ, that is δ·A δ to the inner tolerance: how fast r falls along δ."""
-        a = self.model.arrays
-        total = float((a["rhs"].numpy() * a["direction"].numpy()).sum())
-        if self.model.scene.sliding:
-            total += float((a["euler_rhs"].numpy() * a["euler_direction"].numpy()).sum())
-        return total
+        self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
+        self.model.launch("search", 1)
 
     @property
     def _rounding(self) -> float:
@@ -212,7 +226,7 @@ class StageMethod:
             model.prescribe(position=a["base_position"])
         self._around = before, after
         self._added = self._arrays_added_to()
-        self._graphs = {name: graph for name, graph in self._graphs.items() if name in FORWARD}
+        self._graphs = {name: graph for name, graph in self._graphs.items() if name == "_step"}
 
     def retreat(self) -> None:
         """As of LinearlyImplicitEuler; (−∂r/∂w)ᵀ λ = w̄ is solved to the linear tolerance, with the exact derivative."""
@@ -233,10 +247,12 @@ class StageMethod:
         model.launch("recall", "nodes")
         model.take_inputs()
         self._set_base()
+        if self._is_carried:
+            model.launch("recall_carried_stage", "nodes")
         if self.stages == 2:
             model.launch("recall_first_stage", "nodes")
             first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
-            model.launch("next_base", "nodes", **first)
+            model.launch("next_base", "nodes", start=None, **first)
         for name in ("position", "euler", "velocity", "euler_velocity"):
             if a[name] is not None:
                 wp.copy(a[f"base_{name}"].grad, a[name].grad)
@@ -251,7 +267,10 @@ class StageMethod:
             a.zero_grad("anchor", "rhs", "euler_rhs")
             self.anchor_tape.backward()
             self.tape.backward()
-        model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
+        if self._is_carried:
+            model.launch("carry_adjoint", "nodes", time=a["carried_time"], rate=a["carried_rate"])
+        else:
+            model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
 
     def _enter_first(self) -> None:
         """The stage before it, and w̄ of what it carried to the next."""
@@ -266,7 +285,7 @@ class StageMethod:
         self.model.arrays.zero_grad(*MOVED, *BETWEEN)
         self.model.launch("enter_stage", "nodes")
         self._assemble(matrix=True)
-        self.model.launch("precondition", "nodes")
+        self.model.factorize()
 
     def _solve_adjoint(self) -> None:
         """λ of (−∂r/∂w)ᵀ λ = ρ₀, by GMRES with the preconditioner A, and reverse mode with all of it.
@@ -359,7 +378,7 @@ class StageMethod:
         a = self.model.arrays
         a.zero_grad("rhs", "euler_rhs")
         part = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
-        self.model.solve(tolerance=INNER_TOLERANCE, rhs=a["seed"], euler_rhs=a["euler_seed"], **part)
+        self.model.solve(tolerance=a["inner_tolerance"], rhs=a["seed"], euler_rhs=a["euler_seed"], **part)
 
     def _product(self) -> None:
         """(∂r/∂w)ᵀ of the part in the gradient of the right-hand side."""
