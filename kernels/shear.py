@@ -37,46 +37,50 @@ def functions(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
 
     @wp.func
-    def shear_lock(phi: scalar, radius: scalar, spacing: scalar) -> vec3:
-        """(lock, its first and second derivative by φ) of eq. 5."""
+    def shear_lock(
+        phi: scalar, sine: scalar, cosine: scalar, threshold: scalar, spacing_by_radius: scalar, second: int
+    ) -> vec3:
+        """(lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of φ/2."""
+        zero = scalar(0.0)
         one = scalar(1.0)
-        right = scalar(wp.static(0.5 * wp.PI))
-        sigma = scalar(LOCK_SMOOTHNESS)
-        threshold = scalar(2.0) * wp.asin(radius / spacing)
-        half = scalar(0.5) * phi
-        sine = wp.sin(half)
-        gamma = wp.max((wp.sqrt(scalar(2.0)) - scalar(2.0) * sine) * spacing / radius, scalar(0.0))
-        gamma_rate = -wp.cos(half) * spacing / radius
-        gamma_rate2 = scalar(0.5) * sine * spacing / radius
         two = scalar(2.0)
+        half = scalar(0.5)
+        exponent = scalar(LOCK_EXPONENT)
+        right = scalar(wp.static(0.5 * wp.PI))
+        right4 = scalar(wp.static((0.5 * wp.PI) ** 4))
+        right5 = scalar(wp.static((0.5 * wp.PI) ** 5))
+        gamma = wp.max((scalar(wp.static(2.0**0.5)) - two * sine) * spacing_by_radius, zero)
+        gamma_rate = -cosine * spacing_by_radius
         boost = gamma * gamma * gamma
-        boost_rate = scalar(LOCK_EXPONENT) * gamma * gamma * gamma_rate
-        boost_rate2 = scalar(LOCK_EXPONENT) * gamma * (two * gamma_rate * gamma_rate + gamma * gamma_rate2)
+        boost_rate = exponent * gamma * gamma * gamma_rate
         a = phi - threshold
         b = phi - right
         product = phi * a * b
         product_rate = a * b + phi * b + phi * a
-        product_rate2 = two * (phi + a + b)
-        right2 = right * right
-        right4 = right2 * right2
-        below = product * product + right4 * sigma * sigma
+        by_below = one / (product * product + right4 * scalar(wp.static(LOCK_SMOOTHNESS**2)))
         below_rate = two * product * product_rate
-        below_rate2 = two * (product_rate * product_rate + product * product_rate2)
-        z = right4 * right * a / below
-        z_rate = right4 * right * (below - a * below_rate) / (below * below)
-        z_rate2 = right4 * right * (-two * below_rate - a * below_rate2 + two * a * below_rate * below_rate / below)
-        z_rate2 /= below * below
-        s = wp.tanh(z)
-        lock = scalar(0.5) * ((one + boost) + (one - boost) * s)
+        s = wp.tanh(right5 * a * by_below)
+        z_rate = right5 * by_below * (one - a * below_rate * by_below)
         s_rate = (one - s * s) * z_rate
-        s_rate2 = (one - s * s) * (z_rate2 - two * s * z_rate * z_rate)
-        rate = scalar(0.5) * (boost_rate * (one - s) + (one - boost) * s_rate)
-        rate2 = scalar(0.5) * (boost_rate2 * (one - s) - two * boost_rate * s_rate + (one - boost) * s_rate2)
+        lock = half * ((one + boost) + (one - boost) * s)
+        rate = half * (boost_rate * (one - s) + (one - boost) * s_rate)
+        rate2 = zero
+        if second != 0:
+            gamma_rate2 = half * sine * spacing_by_radius
+            boost_rate2 = exponent * gamma * (two * gamma_rate * gamma_rate + gamma * gamma_rate2)
+            below_rate2 = two * (product_rate * product_rate + product * two * (phi + a + b))
+            z_rate2 = -two * below_rate - a * below_rate2 + two * a * below_rate * below_rate * by_below
+            z_rate2 *= right5 * by_below * by_below
+            s_rate2 = (one - s * s) * (z_rate2 - two * s * z_rate * z_rate)
+            rate2 = half * (boost_rate2 * (one - s) - two * boost_rate * s_rate + (one - boost) * s_rate2)
         return vec3(lock, rate, rate2)
 
     @wp.func
-    def shear_angle(e1: vec3, e2: vec3) -> scalar:
-        return wp.atan2(wp.length(wp.cross(e1, e2)), wp.dot(e1, e2))
+    def shear_angle(t1: vec3, t2: vec3) -> vec3:
+        """(φ, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle (Kahan)."""
+        sine = scalar(0.5) * wp.length(t1 - t2)
+        cosine = scalar(0.5) * wp.length(t1 + t2)
+        return vec3(scalar(2.0) * wp.atan2(sine, cosine), sine, cosine)
 
     return SimpleNamespace(lock=shear_lock, angle=shear_angle)
 
@@ -96,6 +100,7 @@ def define(variant: Variant) -> wp.Kernel:
         shear: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
+        lock_angle: wp.array(dtype=scalar),
         # state in
         position: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=scalar),
@@ -115,7 +120,9 @@ def define(variant: Variant) -> wp.Kernel:
         e2 = position[r] - position[c]
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
-        phi = shear_angle(e1, e2)
+        angle = shear_angle(t1, t2)
+        phi = angle[0]
+        ratio = spacing[0] / radius[0]
         strain = phi - scalar(wp.static(0.5 * wp.PI))
         pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
         k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
@@ -126,12 +133,12 @@ def define(variant: Variant) -> wp.Kernel:
             now = strain * strain
             shut = scalar(wp.static(0.25 * wp.PI * wp.PI))
             if corner_jams[e] != 0:
-                now *= shear_lock(phi, radius[0], spacing[0])[0]
-                shut *= shear_lock(scalar(0.0), radius[0], spacing[0])[0]
+                now *= shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, 0)[0]
+                shut *= shear_lock(scalar(0.0), scalar(0.0), scalar(1.0), lock_angle[0], ratio, 0)[0]
             gain = scalar(0.5) * k * (now - shut)
         curvature = k
         if corner_jams[e] != 0:
-            lock = shear_lock(phi, radius[0], spacing[0])
+            lock = shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, matrix)
             curvature *= lock[0] + scalar(2.0) * strain * lock[1] + scalar(0.5) * strain * strain * lock[2]
             k *= lock[0] + scalar(0.5) * lock[1] * strain
         # ∇φ; where the corner is folded flat its direction is undefined, and normalize gives 0
@@ -194,6 +201,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         shear: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
+        lock_angle: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
@@ -203,14 +211,16 @@ def define_energy(variant: Variant) -> wp.Kernel:
         e1 = position[corner_nodes[e][0]] - position[c]
         e2 = position[corner_nodes[e][2]] - position[c]
         fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
-        phi = shear_angle(e1, e2)
+        angle = shear_angle(wp.normalize(e1), wp.normalize(e2))
+        phi = angle[0]
+        ratio = spacing[0] / radius[0]
         strain = phi - scalar(wp.static(0.5 * wp.PI))
         pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
         k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
         largest = k * scalar(wp.static(0.25 * wp.PI * wp.PI))
         if corner_jams[e] != 0:
-            k *= shear_lock(phi, radius[0], spacing[0])[0]
-            largest *= shear_lock(scalar(0.0), radius[0], spacing[0])[0]
+            k *= shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, 0)[0]
+            largest *= shear_lock(scalar(0.0), scalar(0.0), scalar(1.0), lock_angle[0], ratio, 0)[0]
         faded = k * strain * strain * fading + largest * (scalar(1.0) - fading)
         wp.atomic_add(energy, 0, scalar(0.5) * faded)
 

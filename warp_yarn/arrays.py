@@ -29,6 +29,11 @@ class Arrays(dict[str, Any]):
         self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
+        # Single precision far from 0 would lose the cloth itself: a kilometre away its unit is 60 µm. What is
+        # differentiated by positions stays where it is.
+        near = variant.scalar is wp.float32 and not variant.reverse
+        self.origin = scene.cloth.position.mean(axis=0) if near else np.zeros(3)
+        """Where positions on the device are counted from [m]."""
         self._topology(scene.cloth)
         self._parameters(scene)
         self._state()
@@ -78,6 +83,7 @@ class Arrays(dict[str, Any]):
             self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
         for name in CLOTH_NUMBERS:
             self[name] = self.numbers(getattr(cloth, name))
+        self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
         if scene.gravity is not None:
             self["gravity"] = self.numbers(scene.gravity[None])
         if scene.wind is not None:
@@ -87,9 +93,9 @@ class Arrays(dict[str, Any]):
         if len(scene.pins):
             wanted = cloth.position[scene.pins] if scene.pin_path is None else scene.pin_path[0]
             self["pin_node"] = wp.array(scene.pins, dtype=wp.int32, device=self.device)
-            self["pin_target"] = self.numbers(wanted)
+            self["pin_target"] = self.numbers(wanted - self.origin)
             if scene.pin_path is not None:
-                self["pin_target_path"] = self.numbers(scene.pin_path.reshape(-1, 3))
+                self["pin_target_path"] = self.numbers(scene.pin_path.reshape(-1, 3) - self.origin)
             if scene.pin_stiffness is not None:
                 self["pin_stiffness"] = self.numbers(scene.pin_stiffness)
         if len(scene.force_nodes):

@@ -104,6 +104,7 @@ class Simulator:
         for name, width in STATE_TYPES.items():
             array = self.arrays[name]
             values[name] = None if array is None else array.numpy().reshape(nodes, width).astype(np.float64)
+        values["position"] += self.arrays.origin
         if values["euler_velocity"] is None:
             values["euler_velocity"] = np.zeros((nodes, 2))
         if values["anchor"] is None:
@@ -138,6 +139,8 @@ class Simulator:
             array = self.arrays[name]
             if array is not None:
                 value = np.asarray(getattr(state, name))
+                if name == "position":
+                    value = value - self.arrays.origin
                 array.assign(value if array.dtype == self.arrays.variant.vec3 else value.ravel())
 
     # -- running -----------------------------------------------------------------------------------------------------
@@ -237,6 +240,7 @@ class Simulator:
             if self.moves(name):
                 kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
                 getattr(trajectory, name)[at : at + count] = kept[:count]
+        trajectory.position[at : at + count] += self.arrays.origin
 
     def _frame(self, k: int) -> State:
         """A frame of the chunk on the device."""
