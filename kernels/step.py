@@ -135,7 +135,34 @@ def define(variant: Variant) -> SimpleNamespace:
             if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
                 status[1] = a
 
+    @wp.kernel(module=module, enable_backward=False)
+    def copy_vectors(source: wp.array(dtype=vec3), target: wp.array(dtype=vec3)):
+        i = wp.tid()
+        target[i] = source[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def copy_numbers(source: wp.array(dtype=scalar), target: wp.array(dtype=scalar)):
+        i = wp.tid()
+        target[i] = source[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def clear_vectors(array: wp.array(dtype=vec3)):
+        array[wp.tid()] = vec3()
+
+    @wp.kernel(module=module, enable_backward=False)
+    def clear_matrices(array: wp.array(dtype=mat33)):
+        array[wp.tid()] = mat33()
+
+    @wp.kernel(module=module, enable_backward=False)
+    def clear_numbers(array: wp.array(dtype=scalar)):
+        array[wp.tid()] = scalar(0.0)
+
     return SimpleNamespace(
+        clear_vectors=clear_vectors,
+        clear_matrices=clear_matrices,
+        clear_numbers=clear_numbers,
+        copy_vectors=copy_vectors,
+        copy_numbers=copy_numbers,
         precondition=precondition,
         advance=advance,
         check_order=check_order,

@@ -10,9 +10,12 @@ import numpy as np
 import warp as wp
 
 from .cloth import Cloth
-from .kernels import TERMS, Term, Variant
+from .kernels import TERMS, Term, Variant, build
 from .scene import Scene
 from .state import CLOTH_NUMBERS
+
+LARGE = 1 << 20
+"""Bytes of an array."""
 
 YARN_PARAMETERS = ("density", "stretch", "bend")
 
@@ -70,7 +73,9 @@ class Arrays(dict[str, Any]):
             if not isinstance(values, np.ndarray):
                 continue
             dtype = vectors[1 if values.ndim == 1 else values.shape[1]]
-            self[name] = None if name.startswith(skipped) else wp.array(values, dtype=dtype, device=self.device)
+            # on the CPU the same memory: nothing writes to either
+            shared = {"dtype": dtype, "device": self.device, "copy": False}
+            self[name] = None if name.startswith(skipped) else wp.array(values, **shared)
         free = np.ones(topology.nodes, dtype=np.int32)
         if self.scene.pin_stiffness is None:
             free[self.scene.pins] = 0
@@ -157,7 +162,7 @@ class Arrays(dict[str, Any]):
         """Sets arrays to 0, those that the scene has."""
         for name in names:
             if self[name] is not None:
-                self[name].zero_()
+                self._clear(self[name])
 
     def require_grad(self, *names: str) -> None:
         """Makes room for the gradients of arrays, those that the scene has."""
@@ -169,7 +174,16 @@ class Arrays(dict[str, Any]):
         """Sets gradients to 0, of the arrays that the scene has."""
         for name in names:
             if self[name] is not None:
-                self[name].grad.zero_()
+                self._clear(self[name].grad)
+
+    def _clear(self, array: wp.array) -> None:
+        """Sets an array to 0: by a kernel where it is large, since zero_ is faster, but a graph that is captured on the
+        CPU keeps as many bytes as it clears for itself (Warp 1.19)."""
+        if array.capacity < LARGE:
+            array.zero_()
+        else:
+            kind = {self.variant.vec3: "vectors", self.variant.mat33: "matrices"}.get(array.dtype, "numbers")
+            self.launch(build(self.variant)[f"clear_{kind}"], array.shape[0], array=array)
 
     def launch(self, kernel: wp.Kernel, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel over elements, its arguments found by their names."""

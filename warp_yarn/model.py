@@ -142,6 +142,17 @@ class Model:
         """Launches a kernel by its name (see ``Arrays.launch``)."""
         self.arrays.launch(self.kernels[kernel], elements, **replaced)
 
+    def copy(self, **targets: str) -> None:
+        """Copies arrays, target="source", those that the scene has; ``x_grad`` is the gradient of ``x``."""
+        for target, source in targets.items():
+            self.copy_array(self.arrays.find(target), self.arrays.find(source))
+
+    def copy_array(self, target: wp.array | None, source: wp.array | None) -> None:
+        """By a kernel: wp.copy copies gradients too, and keeps a copy for itself where it is captured on the CPU."""
+        if target is not None:
+            kernel = "copy_vectors" if target.dtype == self.arrays.variant.vec3 else "copy_numbers"
+            self.launch(kernel, target.shape[0], source=source, target=target)
+
     def assemble(self, *, matrix: bool = True, mass: dict[str, wp.array] | None = None, **replaced: Any) -> None:
         """Fills forces, momentum, matrix and right-hand side from the state: the terms of the scene, in their order.
 
@@ -193,12 +204,10 @@ class Model:
             return
         # helpers were launched with arrays of their own
         for name, array in arrays.items():
-            if array is not None:
-                wp.copy(a[f"team_{name}"], array)
+            self.copy_array(a[f"team_{name}"], array)
         self._launch_solve(0)
         for name in ("solution", "euler_solution"):
-            if arrays[name] is not None:
-                wp.copy(arrays[name], a[f"team_{name}"])
+            self.copy_array(arrays[name], a[f"team_{name}"])
 
     def _launch_solve(self, strip: int) -> None:
         arrays = {name: self.arrays[f"team_{name}"] for name in SOLVED}

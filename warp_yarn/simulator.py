@@ -229,10 +229,13 @@ class Simulator:
         return trajectory
 
     def _room(self, frames: int) -> Trajectory:
-        """A trajectory whose frames all hold the present state."""
-        start = self.state
-        repeated = {name: np.repeat(getattr(start, name)[None], frames, axis=0) for name in FIELDS}
-        return Trajectory(self.scene.cloth, self.step_size, **repeated)
+        """A trajectory that holds the present state in its first frame, and in all of what does not change."""
+        start, values = self.state, {}
+        for name in FIELDS:
+            first = getattr(start, name)
+            values[name] = np.empty((frames, *first.shape))
+            values[name][: 1 if self.moves(name) else frames] = first
+        return Trajectory(self.scene.cloth, self.step_size, **values)
 
     def _copy_frames(self, trajectory: Trajectory, at: int, count: int) -> None:
         """Copies the first frames of the chunk on the device to where they belong."""

@@ -38,13 +38,11 @@ class LinearlyImplicitEuler:
         wp.capture_launch(self._forward)
 
     def _step(self) -> None:
-        model, a = self.model, self.model.arrays
+        model = self.model
         model.take_inputs()
         model.assemble()
         # The last velocity is the start: a step changes it little.
-        wp.copy(a["solution"], a["velocity"])
-        if model.scene.sliding:
-            wp.copy(a["euler_solution"], a["euler_velocity"])
+        model.copy(solution="velocity", euler_solution="euler_velocity")
         model.prescribe()
         model.factorize()
         model.solve()
@@ -101,8 +99,8 @@ class LinearlyImplicitEuler:
         model.assemble()
         a.zero_grad(*BETWEEN)
         if a["anchor"] is not None:
-            wp.copy(a["anchor_next"].grad, a["anchor"].grad)
-            a["anchor"].grad.zero_()
+            model.copy(anchor_next_grad="anchor_grad")
+            a.zero_grad("anchor")
             self.anchor_tape.backward()
 
     def _solve(self) -> None:
@@ -114,7 +112,7 @@ class LinearlyImplicitEuler:
         model.solve(rhs=a["seed"], euler_rhs=a["euler_seed"], **multiplier)
         if model.held:
             a.zero("q_x", "q_s")
-            a["solution"].grad.zero_()
+            a.zero_grad("solution")
             model.launch("apply_matrix", 1, p_x=a["rhs"].grad, p_s=a.find("euler_rhs_grad"))
             model.launch("held_adjoint", "pins")
         model.launch("matrix_adjoint", "nodes")

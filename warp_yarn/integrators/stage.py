@@ -11,7 +11,8 @@ import warp as wp
 from ..kernels.step import STALLED
 from ..model import BETWEEN, Model
 
-MOVED = ("position", "euler", "velocity", "euler_velocity", "increment", "euler_increment")
+STATE = ("position", "euler", "velocity", "euler_velocity")
+MOVED = (*STATE, "increment", "euler_increment")
 """Arrays of the stage that w moves."""
 
 INNER_TOLERANCE = 1e-2
@@ -19,11 +20,6 @@ INNER_TOLERANCE = 1e-2
 would not come nearer to the stage's."""
 MOST_PARTS = 100
 """Of GMRES, each kept as a vector."""
-
-
-def _values(array: wp.array) -> wp.array:
-    """The same memory without the gradient."""
-    return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, copy=False)
 
 
 class StageMethod:
@@ -91,13 +87,6 @@ class StageMethod:
             self._graphs[name] = capture.graph
         wp.capture_launch(self._graphs[name])
 
-    def _copy(self, **targets: str) -> None:
-        """Copies arrays: target=source, those that the scene has; not their gradients, as wp.copy would by itself."""
-        a = self.model.arrays
-        for target, source in targets.items():
-            if a[target] is not None:
-                wp.copy(_values(a[target]), _values(a[source]))
-
     # -- forward -----------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
@@ -113,7 +102,7 @@ class StageMethod:
             self._newton(fresh=stage == 0)
         if self._is_carried:
             model.launch("next_base", "nodes", start=None)
-            self._copy(
+            self.model.copy(
                 position="base_position",
                 euler="base_euler",
                 velocity="base_velocity",
@@ -136,12 +125,12 @@ class StageMethod:
         model = self.model
         model.take_inputs()
         model.arrays.zero("newton_iterations")
-        self._copy(solution="velocity", euler_solution="euler_velocity")
+        self.model.copy(solution="velocity", euler_solution="euler_velocity")
         model.prescribe()
         self._set_base()
 
     def _set_base(self) -> None:
-        self._copy(
+        self.model.copy(
             base_position="position",
             base_euler="euler",
             base_velocity="velocity",
@@ -189,7 +178,7 @@ class StageMethod:
         """δ, from A δ = r."""
         a = self.model.arrays
         a.zero("direction", "euler_direction")
-        self._copy(solution_before="solution", euler_solution_before="euler_solution")
+        self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
         self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
         self.model.launch("search", 1)
 
@@ -253,9 +242,7 @@ class StageMethod:
             model.launch("recall_first_stage", "nodes")
             first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
             model.launch("next_base", "nodes", start=None, **first)
-        for name in ("position", "euler", "velocity", "euler_velocity"):
-            if a[name] is not None:
-                wp.copy(a[f"base_{name}"].grad, a[name].grad)
+        model.copy(**{f"base_{name}_grad": f"{name}_grad" for name in STATE})
         a.zero_grad("solution")
 
     def _enter_last(self) -> None:
@@ -263,7 +250,7 @@ class StageMethod:
         model, a = self.model, self.model.arrays
         self._enter()
         if a["anchor"] is not None:
-            wp.copy(a["anchor_next"].grad, a["anchor"].grad)
+            model.copy(anchor_next_grad="anchor_grad")
             a.zero_grad("anchor", "rhs", "euler_rhs")
             self.anchor_tape.backward()
             self.tape.backward()
@@ -277,7 +264,7 @@ class StageMethod:
         model, a = self.model, self.model.arrays
         model.launch("recall", "nodes")
         self._set_base()
-        self._copy(solution="first_solution", euler_solution="euler_first_solution")
+        self.model.copy(solution="first_solution", euler_solution="euler_first_solution")
         self._enter()
         model.launch("carry_adjoint", "nodes", time=a["carried_time"], rate=a["carried_rate"])
 
@@ -396,16 +383,13 @@ class StageMethod:
         model, a = self.model, self.model.arrays
         if model.held:
             # what is held has no λ: its row of ρ is the adjoint of the velocity that holds it
-            a["q_x"].zero_()
+            a.zero("q_x")
             model.launch("held_adjoint", "pins")
         model.launch("absorb_stage", "nodes")
 
     def _finish(self) -> None:
-        a = self.model.arrays
         if self.model.held:
             self.held_tape.backward()
-        for name in ("position", "euler", "velocity", "euler_velocity"):
-            if a[name] is not None:
-                wp.copy(a[name].grad, a[f"base_{name}"].grad)
+        self.model.copy(**{f"{name}_grad": f"base_{name}_grad" for name in STATE})
         _, after = self._around
         after()
