@@ -63,7 +63,7 @@ class Case:
 
     def counts(self) -> tuple[int, ...]:
         """Of steps; large cloths at the longer steps alone."""
-        return COUNTS if self.size < 50 else COUNTS[3:]
+        return COUNTS if self.size < 30 else COUNTS[3:]
 
     def label(self) -> str:
         """What sets it apart from the paper's."""

@@ -30,6 +30,11 @@ FLOOR = 1.0e-7
 whose yarns slide by some 1e-6 m."""
 
 
+SOFTNESS = 0.1
+"""The spring gives way from this part under μF_n to as much beyond, by a parabola, so that the force has a derivative
+at the limit too."""
+
+
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
     scalar = variant.scalar
@@ -57,9 +62,15 @@ def functions(variant: Variant) -> SimpleNamespace:
         spring = stiffness * delta
         spring_slope = stiffness
         if published_scaling == 0:
-            if wp.abs(spring) > limit:
-                spring = wp.sign(delta) * limit
+            soft = scalar(wp.static(SOFTNESS)) * limit
+            if wp.abs(spring) > limit - soft:
+                held = limit
                 spring_slope = scalar(0.0)
+                left = limit + soft - wp.abs(spring)
+                if left > scalar(0.0):
+                    held -= scalar(0.25) * left * left / soft
+                    spring_slope = stiffness * scalar(0.5) * left / soft
+                spring = wp.sign(delta) * held
         half = scalar(0.5)
         one = scalar(1.0)
         f = -half * ((spring - sign * limit) * stuck + spring + sign * limit)

@@ -399,5 +399,11 @@ class Oracle:
         per_length = 1.0 if self.scene.published_scaling else k
         sign = torch.tanh(p * delta * per_length / scale)
         stuck = torch.tanh(p * (limit - torch.abs(others)) / scale)
-        held = k * delta if self.scene.published_scaling else torch.clamp(k * delta, -limit, limit)
+        held = k * delta
+        if not self.scene.published_scaling:
+            # the integral of a slope that falls from 1 to 0 between 0.9 and 1.1 of the limit
+            over = torch.clamp(torch.abs(held) - 0.9 * limit, min=0.0)
+            over = torch.minimum(over, 0.2 * limit)
+            bent = over - over**2 / torch.where(limit > 0.0, 0.4 * limit, 1.0)
+            held = torch.sign(delta) * (torch.minimum(torch.abs(held), 0.9 * limit) + bent)
         return -(0.5 * (held - sign * limit) * stuck + 0.5 * (held + sign * limit))
