@@ -19,10 +19,15 @@ from .variant import Variant
 MOST_TRIES = 400
 """Evaluations in a stage. Newton's iteration takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so
 that violent sliding brings them to dozens."""
-SHORTEST_STEP = 1.0 / 64.0
-"""Of the line search."""
+SHORTEST_STEP = 2.0**-24
+"""Of the line search: where crossings nearly touch, or l and Δs shrink together, which costs next to no energy, it must
+be short indeed."""
+NEAREST = 0.1
+"""Part of a Δs that a step of the iteration leaves of it at least."""
 ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
 """Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
+COARSENESS = {wp.float64: 1e-15, wp.float32: 1e-6}
+"""A few units in the last place."""
 
 
 @functools.cache
@@ -111,6 +116,9 @@ def define(variant: Variant) -> SimpleNamespace:
         direction: wp.array(dtype=vec3),
         euler_direction: wp.array(dtype=scalar),
         shortest: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
         newton_tolerance: wp.array(dtype=scalar),
         # line search, in and out
         slope: wp.array(dtype=scalar),
@@ -132,25 +140,34 @@ def define(variant: Variant) -> SimpleNamespace:
         turned = scalar(0.0)
         of_rhs = scalar(0.0)
         of_solution = scalar(0.0)
+        of_rounding = scalar(0.0)
+        worst = int(-1)
         for i in range(nodes):
             for k in range(3):
                 inverse = inverse_x[i][k]
                 if inverse > scalar(0.0):
+                    of_rounding += position[i][k] * position[i][k] / inverse
                     of_rhs += inverse * rhs[i][k] * rhs[i][k]
                     of_solution += solution[i][k] * solution[i][k] / inverse
                     turned += rhs[i][k] * direction[i][k]
                 elif is_free[i] != 0:
                     # a matrix without bounds: nothing here means anything
                     of_rhs += scalar(wp.static(float("inf")))
+                    worst = i
+                if not wp.isfinite(rhs[i][k]):
+                    worst = i
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
                     inverse = inverse_s[s]
                     if inverse > scalar(0.0):
+                        of_rounding += euler[s] * euler[s] / inverse
                         of_rhs += inverse * euler_rhs[s] * euler_rhs[s]
                         of_solution += euler_solution[s] * euler_solution[s] / inverse
                         turned += euler_rhs[s] * euler_direction[s]
         now = wp.sqrt(of_rhs)
         scale = wp.sqrt(of_solution)
+        # velocities that positions are too coarse to tell from 0
+        rounding = wp.sqrt(of_rounding) * scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
         before = size[0]
         first = tries[0] == 0
         tries[0] = tries[0] + 1
@@ -170,19 +187,20 @@ def define(variant: Variant) -> SimpleNamespace:
                     refreshes[0] = 1
             size[0] = now
             before = now
-            if now <= newton_tolerance[0] * scale:
+            if now <= wp.max(newton_tolerance[0] * scale, rounding):
                 continues[0] = 0
         else:
             solves[0] = 0
             step_length[0] = step_length[0] * scalar(0.5)
             stalled = stalled or step_length[0] < scalar(wp.static(SHORTEST_STEP))
-        residual[0] = before / scale
+        if status[0] == 0:
+            residual[0] = before / scale
         if status[0] != 0:
             continues[0] = 0
         elif not wp.isfinite(before) or not wp.isfinite(scale):
             continues[0] = 0
             status[0] = wp.static(NOT_FINITE)
-            status[1] = -1
+            status[1] = worst
         elif stalled and continues[0] != 0:
             continues[0] = 0
             # what rounding leaves cannot be taken away
@@ -203,6 +221,27 @@ def define(variant: Variant) -> SimpleNamespace:
         wp.atomic_min(
             shortest, 0, euler[2 * segment_nodes[e][1] + direction] - euler[2 * segment_nodes[e][0] + direction]
         )
+
+    @wp.kernel(module=module, enable_backward=False)
+    def keep_order(
+        segment_nodes: wp.array(dtype=wp.vec2i),
+        segment_yarn: wp.array(dtype=int),
+        yarn_direction: wp.array(dtype=int),
+        stage_size: wp.array(dtype=scalar),
+        euler: wp.array(dtype=scalar),
+        euler_direction: wp.array(dtype=scalar),
+        step_length: wp.array(dtype=scalar),
+    ):
+        """Shortens the step along δ so far that it leaves something of every Δs."""
+        e = wp.tid()
+        direction = yarn_direction[segment_yarn[e]]
+        sa = 2 * segment_nodes[e][0] + direction
+        sb = 2 * segment_nodes[e][1] + direction
+        rest = euler[sb] - euler[sa]
+        loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
+        allowed = rest * scalar(wp.static(1.0 - NEAREST))
+        if loss > allowed and rest > scalar(0.0):
+            wp.atomic_min(step_length, 0, allowed / loss)
 
     @wp.kernel(module=module, enable_backward=False)
     def next_base(
@@ -363,6 +402,7 @@ def define(variant: Variant) -> SimpleNamespace:
         search=search,
         judge=judge,
         shortest_segment=shortest_segment,
+        keep_order=keep_order,
         next_base=next_base,
         recall_first_stage=recall_first_stage,
         recall_carried_stage=recall_carried_stage,

@@ -88,7 +88,7 @@ def pull(
     path = np.repeat(cloth.position[None, pins], steps, axis=0)
     path[:, pins.index(end), 0] += speed * step * np.arange(1, steps + 1)
     scene = wy.Scene(cloth, gravity=None, pins=pins, pin_path=path, pin_stiffness=None, **options)
-    simulator = wy.Simulator(scene, step=step, integrator="sdirk2")
+    simulator = wy.Simulator(scene, step=step)
     crossings = [cloth.node(row, column) for column in range(1, cloth.weave.columns - 1)]
     force, contact, slid = [0.0], [simulator.contact()[1][crossings]], [np.zeros(len(crossings))]
     for _ in range(steps):

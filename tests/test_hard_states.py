@@ -13,16 +13,15 @@ import warp_yarn as wy
 import warp_yarn.torch as wt
 from warp_yarn import paper
 
-SETTINGS = {"integrator": "sdirk2"}
-"""None: the defaults of the simulator."""
 RUNS = 10
 STEPS = 10
 ROUNDING = {"double": 1e-12, "single": 1e-5}
 """Of a sum of energies, relative to the largest."""
-OVERSHOOT = 0.05
-"""How far the energy may rise from one step to the next, relative to the start's without gravity, while it stays
-under that of the start: the second-order default does not resolve a crumpled cloth's stretching, and its second stage
-goes on from an extrapolated first. Seen: 0.036, of ``inside_out``."""
+OVERSHOOT = 0.1
+"""How far the energy may rise, relative to the start's without gravity: the second-order default is L-stable, but its
+second stage goes on from an extrapolated first, which may gain from what a step does not resolve. Seen: 0.095 in the
+first steps of ``heavy`` (none at a tenth of the step), 0.05 within ``inside_out``, 0.03 within ``shut``; the others
+lose from step to step."""
 
 
 @dataclasses.dataclass
@@ -262,7 +261,7 @@ STATES = {
 
 
 def simulator(hard: Hard) -> wy.Simulator:
-    return wy.Simulator(hard.scene, **SETTINGS, **hard.options)
+    return wy.Simulator(hard.scene, **hard.options)
 
 
 def rests(cloth: wy.Cloth, euler: np.ndarray) -> np.ndarray:
@@ -302,9 +301,10 @@ def test_ten_times_in_a_row(name: str) -> None:
 def check_energy(energies: list[dict[str, float]], rounding: float) -> None:
     total = np.array([sum(energy.values()) for energy in energies])
     size = max(abs(value) for energy in energies for value in energy.values())
-    assert total[1:].max() <= total[0] + rounding * size
     own = sum(value for name, value in energies[0].items() if name != "gravity")
-    assert np.diff(total).max() <= OVERSHOOT * own + rounding * size
+    # over its start, and over its least so far
+    assert total[1:].max() <= total[0] + OVERSHOOT * own + rounding * size
+    assert (total - np.minimum.accumulate(total)).max() <= OVERSHOOT * own + rounding * size
 
 
 @pytest.mark.parametrize("name", ["straight", "strip", "no_pins", "storm", "heavy"])
@@ -313,7 +313,7 @@ def test_gradient_of_smooth_motion(name: str) -> None:
     hard = STATES[name]()
     steps = 2
     exact = {"tolerance": 1e-12, "newton_tolerance": 1e-13}
-    rollout = wt.Rollout(hard.scene, steps, frames=[steps], **SETTINGS, **exact)
+    rollout = wt.Rollout(hard.scene, steps, frames=[steps], **exact)
     start = hard.start(0)
     random = torch.Generator().manual_seed(1)
     values = {

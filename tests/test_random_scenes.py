@@ -7,8 +7,6 @@ from hypothesis import strategies as st
 import warp_yarn as wy
 
 STEPS = 100
-SETTINGS = {"integrator": "sdirk2"}
-"""None: the defaults of the simulator."""
 
 
 def log_uniform(low: float, high: float) -> st.SearchStrategy[float]:
@@ -71,7 +69,7 @@ def scenes(draw: st.DrawFn) -> tuple[wy.Scene, float]:
 @given(scenes())
 def test_success_or_an_error_of_ours(case: tuple[wy.Scene, float]) -> None:
     scene, step = case
-    simulator = wy.Simulator(scene, step=step, **SETTINGS)
+    simulator = wy.Simulator(scene, step=step)
     try:
         trajectory = simulator.run(STEPS)
         assert len(trajectory) == STEPS + 1

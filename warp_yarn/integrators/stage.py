@@ -181,6 +181,8 @@ class StageMethod:
         self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
         self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
         self.model.launch("search", 1)
+        if self.model.scene.sliding:
+            self.model.launch("keep_order", "segments")
 
     @property
     def _rounding(self) -> float:
