@@ -1,11 +1,31 @@
-"""That the benchmarks compare like with like. Nothing is timed here."""
+"""That the benchmarks compare like with like, and that the charts show what they say. Nothing is timed here."""
 
 import csv
+import dataclasses
 
+import numpy as np
 import pytest
-from scripts import load
+import warp as wp
+from scripts import exit_code, load
+
+import warp_yarn as wy
+from warp_yarn import ablation
+from warp_yarn.ablation import ablate
 
 solver = load("benchmarks/solver.py")
+work = load("benchmarks/work_precision.py")
+sizes = load("benchmarks/sizes.py")
+bandwidth = load("benchmarks/bandwidth.py")
+terms = load("benchmarks/terms.py")
+terms_scene = load("scenes/terms.py")
+
+
+@pytest.fixture(autouse=True)
+def on_all_cores(monkeypatch):
+    """The tests' own process keeps its cores."""
+    monkeypatch.setattr(bandwidth, "cores", lambda count: None)
+    for module in (work, sizes, terms):
+        monkeypatch.setattr(module, "one_core", lambda: None)
 
 
 def test_ours_and_scipy_solve_the_same_system_to_the_same_tolerance():
@@ -33,6 +53,354 @@ def test_a_row_reaches_the_csv_file_with_the_environment(tmp_path):
     assert read["unknowns"] == "29"
     assert float(read["scipy [ms]"]) > 0.0
     assert {"processor", "warp-lang", "scipy", "revision"} <= set(read)
+
+
+# -- benchmarks/work_precision.py -------------------------------------------------------------------------------------
+
+
+def timed(*seconds):
+    return [work.Timing.of([s]) for s in seconds]
+
+
+def curve_points(errors, seconds=None):
+    """Points at halving steps, each costing twice as much."""
+    seconds = seconds or [2.0**k for k in range(len(errors))]
+    return [work.Point(2.0**-k, e, t, 0.0) for k, (e, t) in enumerate(zip(errors, timed(*seconds), strict=True))]
+
+
+def test_extrapolation_takes_the_leading_powers_out():
+    limit, rough = np.array([[1.0, 2.0, 3.0]]), np.array([[4.0, -5.0, 6.0]])
+    for order in (1, 2):
+        ends = [limit + rough * h**order + 7.0 * rough * h ** (order + 1) for h in (0.4, 0.2, 0.1)]
+        np.testing.assert_allclose(work.extrapolated(ends, order), limit, rtol=1e-12)
+
+
+def test_a_slope_is_fitted_to_what_is_charted():
+    # of second order, but for an error above 1 %, and the last one
+    points = curve_points([0.5, 0.008, 0.002, 0.0005, 0.0005])
+    assert work.slope(points[:4], floor=0.0004) == pytest.approx(2.0)
+    # a straight line through 3, 1, -1, -1, in powers of 2 above the last: 1.4 a step
+    assert work.slope(points, floor=0.0004) == pytest.approx(1.4)
+    # below the floor are all but two
+    assert work.slope(points, floor=0.001) is None
+
+
+def test_the_time_to_an_error_is_where_a_curve_stays_below_it():
+    # 0.04 to 0.01 takes 1 to 2 s: 0.02 is half of the way in logarithms
+    assert work.time_to(curve_points([0.04, 0.01]), 0.02) == (pytest.approx(2.0**0.5), False)
+    # what was near by chance at the second step does not count
+    assert work.time_to(curve_points([0.04, 0.01, 0.04, 0.01]), 0.02) == (pytest.approx(4.0 * 2.0**0.5), False)
+    assert work.time_to(curve_points([0.01, 0.005]), 0.02) == (1.0, True)
+    assert work.time_to(curve_points([0.04, 0.03]), 0.02) is None
+    # a failed run is no point of the curve
+    assert work.time_to(curve_points([None, 0.04, 0.01]), 0.02) == (pytest.approx(2.0 * 2.0**0.5), False)
+    assert work.time_to([], 0.02) is None
+
+
+SHORT = dataclasses.replace(work.MOTIONS["hung"], duration=5e-3, finest=1e-3 / 128)
+"""The hung cloth for 5 ms: smooth, and every method is soon near."""
+
+
+def test_steps_fit_into_the_motions():
+    for motion in work.MOTIONS.values():
+        assert all(motion.steps(step) * step == pytest.approx(motion.duration) for step in work.STEPS)
+    with pytest.raises(wy.InputError, match="whole times"):
+        SHORT.steps(3e-3)
+
+
+def test_two_methods_agree_on_the_reference(monkeypatch):
+    monkeypatch.setitem(work.MOTIONS, "hung", SHORT)
+    found = work.reference(SHORT, 4)
+    assert found.check in work.INTEGRATORS
+    assert found.check != work.REFERENCE
+    # seen: 9e-6; the errors below are 1000 times it
+    assert found.uncertainty < 3e-5
+    curve = work.Curve("hung", "linear", "double", None)
+    monkeypatch.setattr(work, "STEPS", tuple(1e-3 / 2**k for k in range(5)))
+    errors = [p.error for p in work.points(curve, 4, found, repeats=1, longest=60.0)]
+    assert len(errors) == 5
+    # first order; seen: 0.95 to 0.99
+    assert np.log2(errors[-2] / errors[-1]) == pytest.approx(1.0, abs=0.1)
+    # a curve ends before a run that would take too long
+    assert len(work.points(curve, 4, found, repeats=1, longest=0.0)) == 1
+
+
+def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
+    # squares of such velocities are not finite
+    monkeypatch.setitem(work.MOTIONS, "hung", dataclasses.replace(SHORT, speed=(0.0, 0.0, 1e200)))
+    curve = work.Curve("hung", "linear", "double", None)
+    converged = work.Reference(np.zeros((16, 3)), 1.0, "none", 1e-5)
+    failed = work.point(curve, 4, 1e-3, converged, repeats=1)
+    assert failed.error is None
+    assert "not finite" in failed.failure
+    assert failed.timing.median > 0.0
+    assert failed.columns(0.0)["error"] == "failed"
+    fine = curve_points([0.04, 0.01])
+    found = {curve: [*fine, failed]}
+    (row,) = work.summary(found, floor=1e-3)
+    assert row["failed"] == 1
+    drawn = work.draw(found, {"hung": converged}, 4)
+    assert any(line.get_marker() == "x" for line in drawn.axes[0].lines)
+
+
+def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(work.MOTIONS, "hung", SHORT)
+    monkeypatch.setattr(work, "STEPS", (1e-3, 5e-4, 2.5e-4))
+    output, plot = tmp_path / "wp.csv", tmp_path / "wp.png"
+    work.main(["--size", "3", "--motions", "hung", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    curves = sum(map(len, work.CURVES.values())) * len(work.INTEGRATORS)
+    assert len({(row["method"], row["precision"], row["tolerance"]) for row in rows}) == curves
+    assert {row["check"] for row in rows} <= set(work.INTEGRATORS)
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    with open(tmp_path / "wp_summary.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == curves
+    assert "of that from" in capsys.readouterr().out
+
+
+# -- benchmarks/sizes.py ----------------------------------------------------------------------------------------------
+
+
+def test_array_bytes_counts_each_memory_once():
+    simulator = wy.Simulator(wy.paper.hung_cloth(rows=5, columns=5))
+    counted = sizes.array_bytes(simulator)
+    simulator.arrays["again"] = simulator.arrays["position"]
+    assert sizes.array_bytes(simulator) == counted
+    simulator.arrays["more"] = simulator.arrays.zeros(7, wp.vec3d)
+    assert sizes.array_bytes(simulator) == counted + 7 * 24
+
+
+def test_chart_2_from_the_command(monkeypatch, tmp_path, capsys):
+    # in this process: its memory says nothing
+    monkeypatch.setattr(sizes, "apart", sizes.measured)
+    monkeypatch.setattr(sizes, "LARGE", 3)
+    output, plot = tmp_path / "s.csv", tmp_path / "s.png"
+    sizes.main(["--sizes", "3", "5", "--steps", "1", "--output", str(output), "--plot", str(plot)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["size"], row["sliding"]) for row in rows] == [
+        ("3 × 3", "True"), ("5 × 5", "True"), ("3 × 3", "False"), ("5 × 5", "False"),
+    ]  # fmt: skip
+    assert all(float(row["step [ms]"]) > 0.0 and float(row["iterations"]) > 0.0 for row in rows)
+    assert float(rows[0]["relative to 3 × 3"]) == 1.0
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert "slope of time over crossings" in capsys.readouterr().out
+
+
+def test_the_slope_of_sizes_is_that_of_time_over_crossings():
+    rows = [{"crossings": n * n, "step [ms]": 0.1 * n**3, "failure": ""} for n in (10, 50, 100, 200)]
+    rows[0]["step [ms]"] = 1e3  # small: no part in it
+    rows.append({"crossings": 9e4, "step [ms]": "", "failure": "step 1"})
+    assert sizes.slope(rows) == pytest.approx(1.5)
+    assert sizes.slope(rows[:2]) is None
+
+
+def test_a_size_that_fails_is_a_row_with_a_reason(monkeypatch):
+    def apart(size, *arguments):
+        fine = {"seconds": [1.0], "iterations": 3.0, "made": 0.1, "peak": 2000, "arrays": 1000}
+        return {"failure": "step 1: torn"} if size == 7 else fine
+
+    monkeypatch.setattr(sizes, "apart", apart)
+    rows = sizes.benchmark((7, 5), True, "linear", 1)
+    assert [row["failure"] for row in rows] == ["step 1: torn", ""]
+    assert set(rows[0]) == set(rows[1])
+    assert rows[1]["arrays per crossing [kB]"] == pytest.approx(1.0 / 25)
+
+
+# -- benchmarks/bandwidth.py ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preconditioner", bandwidth.PASSES)
+def test_the_passes_have_every_array_of_the_iteration(preconditioner):
+    simulator = wy.Simulator(wy.paper.hung_cloth(rows=3, columns=3), preconditioner=preconditioner)
+    kernel = simulator.model.kernels[f"{preconditioner}_conjugate_gradient"]
+    arrays = {a.label for a in kernel.adj.args if isinstance(a.type, wp.array)}
+    # what only the beginning reads, and what the end reports
+    once = {"rhs", "euler_rhs", "tolerance", "iterations", "residual", "status"}
+    # where several threads meet
+    once |= {"team", "sums"}
+    counted = {name for read, written in bandwidth.PASSES[preconditioner] for name in f"{read} {written}".split()}
+    assert counted == arrays - once
+
+
+def test_bytes_of_an_iteration_without_sliding():
+    # a node's: blocks 72, vectors 24, six neighbours
+    neighbours, blocks, vector, block = 6 * 4, 6 * 72, 24, 72
+    expected = {
+        "incomplete": (neighbours + blocks + block + (2 + 3) * vector)
+        + (neighbours + blocks + 3 * block + (3 + 1) * vector)
+        + (block + (4 + 3) * vector),
+        "jacobi": (neighbours + blocks + block + 3 * vector) + 2 * vector + (5 + 3) * vector + 4 * vector,
+    }
+    for preconditioner, each in expected.items():
+        scene = wy.paper.hung_cloth(rows=4, columns=6, sliding=False)
+        simulator = wy.Simulator(scene, preconditioner=preconditioner)
+        assert bandwidth.iteration_bytes(simulator) == 24 * each
+
+
+def test_a_solve_makes_the_iterations_that_it_is_asked_for():
+    solver = bandwidth.Solver(9, True, "incomplete", 1)
+    assert solver.solve(bandwidth.LONG) > 0.0
+    assert int(solver.simulator.arrays["iterations"].numpy()[0]) == bandwidth.LONG
+    assert not solver.simulator.arrays["status"].numpy().any()
+    # past the attainable accuracy it stops, and then there is nothing to divide by
+    with pytest.raises(RuntimeError, match="nothing can be told"):
+        solver.solve(1000)
+
+
+def test_chart_3_from_the_command(monkeypatch, tmp_path):
+    monkeypatch.setattr(bandwidth, "ELEMENTS", 3000)
+    output, plot = tmp_path / "b.csv", tmp_path / "b.png"
+    bandwidth.main(["--sizes", "9", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["preconditioner"], row["threads"]) for row in rows} >= {("incomplete", "1"), ("jacobi", "1")}
+    assert all(float(row["triad [GB/s]"]) > 0.0 for row in rows)
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_triad_moves_what_it_says():
+    triad = bandwidth.Triad(2, elements=600)
+    assert triad.run() > 0.0
+    assert triad.bytes == 4 * 8 * 600
+    # twice: once at the beginning; a += b + 2 c of ones
+    for part in triad.parts:
+        np.testing.assert_array_equal(part[2].numpy(), np.full((100, 3), 7.0))
+
+
+# -- warp_yarn/ablation.py, scenes/terms.py, benchmarks/terms.py ------------------------------------------------------
+
+
+def moved_by_hand(scene, changed, steps, step):
+    """As Change.moved says, from two plain runs."""
+    a, b = (wy.Simulator(s, step=step).run(steps).position for s in (scene, changed))
+    return np.sqrt(((a - b) ** 2).sum(axis=-1).mean() / ((a - a[0]) ** 2).sum(axis=-1).mean())
+
+
+def test_each_thing_left_out_is_the_scene_without_it():
+    scene = wy.paper.hung_cloth(rows=4, columns=4)
+    found = ablate(scene, steps=4, step=1e-3, repeats=1)
+    changes = {change.name: change for change in found.changes}
+    assert set(changes) == {*scene.terms, "sliding"} - {"mass", "pins"}
+    without_wind = wy.Scene(scene.cloth, pins=scene.pins)
+    assert changes["wind"].moved == pytest.approx(moved_by_hand(scene, without_wind, 4, 1e-3), rel=1e-9)
+    locked = wy.paper.hung_cloth(rows=4, columns=4, sliding=False)
+    assert changes["sliding"].moved == pytest.approx(moved_by_hand(scene, locked, 4, 1e-3), rel=1e-9)
+    half = wy.Simulator(scene, step=5e-4).run(8).position[::2]
+    whole = wy.Simulator(scene, step=1e-3).run(4).position
+    error = np.sqrt(((whole - half) ** 2).sum(axis=-1).mean() / ((whole - whole[0]) ** 2).sum(axis=-1).mean())
+    assert found.step_error == pytest.approx(error, rel=1e-9)
+    assert all(changes[name].moved < found.step_error for name in found.unneeded)
+    assert found.seconds > 0.0
+
+
+def test_a_term_that_cannot_be_left_out_has_the_reason(monkeypatch):
+    scene = wy.paper.hung_cloth(rows=4, columns=4)
+
+    class Frictional(wy.Simulator):
+        def run(self, steps):
+            trajectory = super().run(steps)
+            if "friction" in self.scene.terms or not self.scene.sliding:
+                return trajectory
+            raise wy.SimulationError("step 2: torn. Try", step=2, node=-1, term=None, trajectory=trajectory.cut(2))
+
+    monkeypatch.setattr(ablation, "Simulator", Frictional)
+    changes = {change.name: change for change in ablate(scene, steps=3, repeats=1).changes}
+    assert changes["friction"].moved is None
+    assert str(changes["friction"]) == "friction cannot be left out: step 2: torn"
+    assert changes["sliding"].moved is not None
+
+
+def test_half_the_step_keeps_paths_in_time():
+    cloth = wy.paper.cloth(rows=4, columns=4)
+    pins = cloth.corners("top")
+    path = cloth.position[pins] + np.linspace(0.0, 1e-3, 5)[1:, None, None]
+    force = np.linspace(1e-4, 3e-4, 3)[:, None] * [[0.0, 1.0, 0.0]]
+    scene = wy.Scene(cloth, pins=pins, pin_path=path, forces={cloth.node(3, 1): force})
+    half = ablation._halved(scene)
+    whole, fine = wy.Simulator(scene, step=1e-5), wy.Simulator(half, step=5e-6)
+    # what holds a step of the whole holds two of the half: their mean forces are equal at every such step
+    for _ in range(6):
+        whole.run(1)
+        targets = whole.arrays["pin_target"].numpy(), whole.arrays["applied_force"].numpy()
+        for _ in range(2):
+            fine.run(1)
+            np.testing.assert_array_equal(fine.arrays["pin_target"].numpy(), targets[0])
+            np.testing.assert_array_equal(fine.arrays["applied_force"].numpy(), targets[1])
+
+
+def test_a_still_cloth_has_nothing_to_be_relative_to():
+    cloth = wy.paper.cloth(rows=3, columns=3)
+    with pytest.raises(wy.InputError, match="does not move"):
+        ablate(wy.Scene(cloth, gravity=None), steps=1, repeats=1)
+
+
+def test_what_the_lines_say():
+    sliding = ablation.Change("sliding", 2e-4, 0.55, 0.01)
+    bending = ablation.Change("bending", 0.0123, -0.05, 0.01)
+    friction = ablation.Change("friction", 0.5, -7.0, 0.1)
+    assert str(sliding) == "sliding moves the cloth by 0.02 % and costs 55 % of the step"
+    assert str(bending) == "bending moves the cloth by 1.2 % and costs nothing"
+    assert str(friction) == "friction moves the cloth by 50 %, and without it a step takes 8.0 times as long"
+    found = ablation.Ablation(1e-3, 1e-3, (sliding, bending), ("sliding",), None)
+    assert found.lines()[-1] == "at this step the scene does not need: sliding"
+    torn = ablation.Change("sliding, wind", None, None, 0.0, "step 3: torn. Try a smaller step")
+    found = ablation.Ablation(1e-3, 1e-3, (sliding,), ("sliding", "wind"), torn)
+    assert found.lines()[-1].endswith("but it needs one of them: step 3: torn")
+
+
+def test_what_sliding_leaves_out_is_named_once():
+    changes = [ablation.Change(name, 1e-9, 0.1, 0.0) for name in ("friction", "parallel", "bending", "sliding")]
+    assert ablation._unneeded(changes, 1e-3) == ("bending", "sliding")
+    assert ablation._unneeded(changes[:3], 1e-3) == ("friction", "parallel", "bending")
+
+
+def test_the_command_takes_a_scene_from_a_file(tmp_path, capsys):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import warp_yarn as wy\n"
+        "cloth = wy.paper.cloth('twill', rows=4, columns=5)\n"
+        "scene = wy.Scene(cloth, pins=cloth.corners('top'), sliding=False)\n"
+    )
+    found = terms_scene.main([str(file), "--steps", "3", "--repeats", "1"])
+    assert [change.name for change in found.changes] == ["stretch", "bending", "gravity", "shear"]
+    told = capsys.readouterr().out
+    assert "4 × 5 yarns, 3 steps of 0.5 ms" in told
+    assert "gravity moves the cloth by 100 %" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["nowhere.py"], "nowhere.py: there is no such file"),
+        (["empty.py"], "must set `scene`"),
+        (["empty.py", "--size", "5"], "--size"),
+        (["--steps", "0"], "--steps = 0"),
+        (["--repeats", "0"], "--repeats = 0"),
+        (["--step", "0"], "step = 0"),
+        (["--size", "2"], "rows = 2"),
+        (["--integrator", "magic"], "--integrator"),
+    ],
+)
+def test_wrong_arguments_of_the_command(arguments, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.py").write_text("")
+    assert exit_code(terms_scene, arguments) == 2
+    assert named in capsys.readouterr().err
+
+
+def test_chart_4_from_the_command(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(terms.MOTIONS, "hung", SHORT)
+    output, plot = tmp_path / "t.csv", tmp_path / "t.png"
+    terms.main(["--size", "3", "--motions", "hung", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
+    with open(output, newline="") as file:
+        rows = {row["left out"]: row for row in csv.DictReader(file)}
+    assert {"stretch", "shear", "wind", "sliding"} <= set(rows)
+    assert rows["wind"]["needed"] == "yes"
+    assert float(rows["wind"]["moved"]) > 0.1
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert "wind moves the cloth by" in capsys.readouterr().out
 
 
 # -- stability -------------------------------------------------------------------------------------------------------
