@@ -183,7 +183,7 @@ def define(variant: Variant) -> SimpleNamespace:
             if not first:
                 newton_iterations[0] = newton_iterations[0] + 1
                 # a step that hardly helps: the matrix is of another state
-                if now > scalar(0.1) * before:
+                if now > scalar(0.3) * before:
                     refreshes[0] = 1
             size[0] = now
             before = now
@@ -191,6 +191,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 continues[0] = 0
         else:
             solves[0] = 0
+            refreshes[0] = 1
             step_length[0] = step_length[0] * scalar(0.5)
             stalled = stalled or step_length[0] < scalar(wp.static(SHORTEST_STEP))
         if status[0] == 0:
