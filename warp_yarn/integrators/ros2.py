@@ -32,9 +32,9 @@ class ROS2(LinearlyImplicitEuler):
     here, they make a fifth of the error that those of the first do at 0.5 ms of the paper's cloth.
 
     L-stable where H and D are exact, and weakly so elsewhere: what is stiff and has θ times the stiffness that H says
-    is multiplied by 1 − 2θ/γ + θ²/(2γ²) a step, which grows beyond θ = 4γ = 1.17 (eq. 2: beyond 2). A cloth that buckles
-    is so driven to many times its energy, without an error: the paper's of 9 × 9 at steps of 0.5 to 2 ms from the first
-    buckling (0.1 s) on, at 0.25 ms after 0.46 s; at 0.125 ms it went on well for 0.6 s.
+    is multiplied by 1 − 2θ/γ + θ²/(2γ²) a step, which grows beyond θ = 4γ = 1.17 (eq. 2: beyond 2). A cloth that
+    buckles may gain many times its energy, and no error says so: the paper's of 9 × 9 did at steps of 0.5 to 2 ms from
+    its first buckling (0.1 s) on, and at 0.25 ms after 0.46 s; at 0.125 ms it went on well for 0.6 s.
 
     M is never inverted alone. Where it is singular, in the sliding coordinates, a step is that of ROS2 for
     D q̇ = F(q), w₁ and w₂ being its k; q̇⁺ forgets q̇ there, and goes on from what D and F make of it.
