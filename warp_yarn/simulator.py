@@ -18,7 +18,7 @@ from .system import System, gather
 
 CHUNK_BYTES = 1 << 24
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
-SMALLEST_PART = 2.0**-10
+SMALLEST_PART = 2.0**-7
 """Of a step: one that cannot be made is split in two, and its halves again, down to this."""
 
 

@@ -110,7 +110,7 @@ class LinearlyImplicitEuler:
         a = self.model.arrays
         a.zero_grad(*BETWEEN)
         if a["anchor"] is not None:
-            model.copy(anchor_next_grad="anchor_grad")
+            self.model.copy(anchor_next_grad="anchor_grad")
             a.zero_grad("anchor")
             self.anchor_tape.backward()
 

@@ -65,9 +65,7 @@ class ROS2(LinearlyImplicitEuler):
         first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
         model.take_inputs()
         self._assemble_first()
-        wp.copy(a["first_solution"], a["velocity"])
-        if model.scene.sliding:
-            wp.copy(a["euler_first_solution"], a["euler_velocity"])
+        model.copy(first_solution="velocity", euler_first_solution="euler_velocity")
         model.prescribe(solution=a["first_solution"])
         model.factorize()
         model.solve(**first)
