@@ -19,6 +19,7 @@ from . import (
     inertia,
     parallel,
     pins,
+    ros2,
     shear,
     solver,
     stage,
@@ -60,7 +61,8 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
         if term.contact_load is not None:
             kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
-    kernels |= vars(step.define_reversible(variant))
-    for part in (step, solver, incomplete, history, adjoint, stage):
+    for part in (step, ros2):
+        kernels |= vars(part.define_reversible(variant))
+    for part in (step, solver, incomplete, history, adjoint, stage, ros2):
         kernels |= vars(part.define(variant.forward))
     return kernels

@@ -137,10 +137,13 @@ def define(variant: Variant) -> wp.Kernel:
         rest = euler[sb] - euler[sa]
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
-        s1 = presence(wp.length(e1), spacing[0])
-        s2 = presence(wp.length(e2), spacing[0])
-        by_l1 = inverse_length(wp.length(e1), spacing[0])
-        by_l2 = inverse_length(wp.length(e2), spacing[0])
+        l1 = wp.length(e1)
+        l2 = wp.length(e2)
+        s1 = presence(l1, spacing[0])
+        s2 = presence(l2, spacing[0])
+        by_l1 = inverse_length(l1, spacing[0])
+        by_l2 = inverse_length(l2, spacing[0])
+        # by division: a straight yarn's are exact opposites
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
         k = scalar(2.0) * bend_stiffness(bend[bend_yarn[e]], radius[0]) / rest
@@ -270,13 +273,16 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
         center = position[c] + normal[c] * crimp
         e1 = position[b] + normal[b] * crimp - center
         e2 = position[a] + normal[a] * crimp - center
+        l1 = wp.length(e1)
+        l2 = wp.length(e2)
+        s1 = presence(l1, spacing[0])
+        s2 = presence(l2, spacing[0])
+        by_l1 = inverse_length(l1, spacing[0])
+        by_l2 = inverse_length(l2, spacing[0])
+        # by division: a straight yarn's are exact opposites
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
         k = scalar(2.0) * bend_stiffness(bend[bend_yarn[e]], radius[0]) / rest
-        s1 = presence(wp.length(e1), spacing[0])
-        s2 = presence(wp.length(e2), spacing[0])
-        by_l1 = inverse_length(wp.length(e1), spacing[0])
-        by_l2 = inverse_length(wp.length(e2), spacing[0])
         angle = bend_angle(t1, t2)
         f_b = bend_force(t1, t2, by_l1, s1, s2, k, angle[0], angle[1]) * half
         f_a = bend_force(t2, t1, by_l2, s2, s1, k, angle[0], angle[1]) * half

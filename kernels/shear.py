@@ -28,6 +28,8 @@ from .variant import Term, Variant
 OF_CURVATURE = 0.8
 """The part of V'' that the matrix has at least: little enough that V'/(φ − φ̄), which it is in ordinary motion, is more
 within 25 degrees of the right angle."""
+FLAT = {wp.float64: 1e-12, wp.float32: 1e-5}
+"""Sine of an angle that cannot be told from a fold's: what t₁ cos φ − t₂ is there, is rounding."""
 LOCK_EXPONENT = 3
 LOCK_SMOOTHNESS = 0.6
 
@@ -118,16 +120,20 @@ def define(variant: Variant) -> wp.Kernel:
         r = corner_nodes[e][2]
         e1 = position[p] - position[c]
         e2 = position[r] - position[c]
-        t1 = wp.normalize(e1)
-        t2 = wp.normalize(e2)
+        l1 = wp.length(e1)
+        l2 = wp.length(e2)
+        by_l1 = inverse_length(l1, spacing[0])
+        by_l2 = inverse_length(l2, spacing[0])
+        t1 = e1 * by_l1
+        t2 = e2 * by_l2
         angle = shear_angle(t1, t2)
         phi = angle[0]
         ratio = spacing[0] / radius[0]
         strain = phi - scalar(wp.static(0.5 * wp.PI))
         pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
         k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
-        s_p = presence(wp.length(e1), spacing[0])
-        s_r = presence(wp.length(e2), spacing[0])
+        s_p = presence(l1, spacing[0])
+        s_r = presence(l2, spacing[0])
         gain = scalar(0.0)
         if s_p[0] * s_r[0] < scalar(1.0):
             now = strain * strain
@@ -141,10 +147,11 @@ def define(variant: Variant) -> wp.Kernel:
             lock = shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, matrix)
             curvature *= lock[0] + scalar(2.0) * strain * lock[1] + scalar(0.5) * strain * strain * lock[2]
             k *= lock[0] + scalar(0.5) * lock[1] * strain
-        # ∇φ; where the corner is folded flat its direction is undefined, and normalize gives 0
+        # ∇φ; where the corner is folded flat its direction is undefined, and becomes 0
         across = wp.dot(t1, t2)
-        g_p = wp.normalize(t1 * across - t2) * inverse_length(wp.length(e1), spacing[0])
-        g_r = wp.normalize(t2 * across - t1) * inverse_length(wp.length(e2), spacing[0])
+        by_sine = scalar(1.0) / wp.max(scalar(2.0) * angle[1] * angle[2], scalar(wp.static(FLAT[scalar])))
+        g_p = (t1 * across - t2) * (by_sine * by_l1)
+        g_r = (t2 * across - t1) * (by_sine * by_l2)
         g_c = -(g_p + g_r)
         k *= s_p[0] * s_r[0]
         curvature *= s_p[0] * s_r[0]

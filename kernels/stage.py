@@ -16,7 +16,7 @@ import warp as wp
 from .step import NOT_FINITE, STALLED
 from .variant import Variant
 
-MOST_TRIES = 400
+MOST_TRIES = 200
 """Evaluations in a stage. Newton's iteration takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so
 that violent sliding brings them to dozens."""
 SHORTEST_STEP = 2.0**-24
@@ -26,7 +26,7 @@ NEAREST = 0.1
 """Part of a Δs that a step of the iteration leaves of it at least."""
 ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
 """Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
-COARSENESS = {wp.float64: 1e-15, wp.float32: 1e-6}
+COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
 """A few units in the last place."""
 
 
@@ -183,14 +183,17 @@ def define(variant: Variant) -> SimpleNamespace:
             if not first:
                 newton_iterations[0] = newton_iterations[0] + 1
                 # a step that hardly helps: the matrix is of another state
-                if now > scalar(0.1) * before:
+                if now > scalar(0.3) * before:
                     refreshes[0] = 1
+            # what no longer falls, and is less than positions can tell, is rounding
+            settled = not first and now > scalar(0.5) * before and now <= rounding
             size[0] = now
             before = now
-            if now <= wp.max(newton_tolerance[0] * scale, rounding):
+            if now <= newton_tolerance[0] * scale or settled:
                 continues[0] = 0
         else:
             solves[0] = 0
+            refreshes[0] = 1
             step_length[0] = step_length[0] * scalar(0.5)
             stalled = stalled or step_length[0] < scalar(wp.static(SHORTEST_STEP))
         if status[0] == 0:
@@ -204,7 +207,7 @@ def define(variant: Variant) -> SimpleNamespace:
         elif stalled and continues[0] != 0:
             continues[0] = 0
             # what rounding leaves cannot be taken away
-            if not (before <= scalar(wp.static(ROUNDING[scalar])) * scale):
+            if not (before <= wp.max(scalar(wp.static(ROUNDING[scalar])) * scale, rounding)):
                 status[0] = wp.static(STALLED)
                 status[1] = -1
 

@@ -28,9 +28,9 @@ def functions(variant: Variant) -> SimpleNamespace:
     def presence(length: scalar, spacing: scalar) -> vec3:
         """(s, s', s'') of a segment."""
         reach = spacing * scalar(wp.static(REACH))
-        x = length / reach
-        if x >= scalar(1.0):
+        if length >= reach:
             return vec3(scalar(1.0), scalar(0.0), scalar(0.0))
+        x = length / reach
         left = scalar(1.0) - x
         return vec3(
             x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x)),

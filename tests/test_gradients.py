@@ -153,9 +153,9 @@ OF_SLIDING = ("friction", "friction_stiffness", "friction_damping", "friction_sh
 @pytest.mark.parametrize("slippery", [False, True], ids=["the paper's cloth", "a slippery cloth"])
 def test_every_parameter_of_the_hung_cloth(slippery: bool) -> None:
     # On the paper's cloth sliding moves positions by less than differences can resolve, so what rules sliding is
-    # differentiated where yarns slide farther, and the rest where no crossing passes friction's kinks. After more than
-    # 30 steps the slippery one passes them, and differences by friction agree with themselves to 1e-4 only.
-    rollout, values = hung(0.5, 0.1, 30) if slippery else hung(0.5, 1000.0)
+    # differentiated where yarns slide farther, and the rest where no crossing passes friction's kinks. After more
+    # than 15 steps the slippery one passes them, and differences by friction agree with themselves less and less.
+    rollout, values = hung(0.5, 0.1, 15) if slippery else hung(0.5, 1000.0)
     names = [name for name in values if (name in OF_SLIDING) == slippery]
     weights = torch.randn(rollout.steps + 1, 36, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     rest = torch.tensor(rollout.scene.cloth.position)

@@ -65,7 +65,7 @@ def scenes(draw: st.DrawFn) -> tuple[wy.Scene, float]:
     return scene, draw(log_uniform(1e-4, 1.0 / 30.0))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=12, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow])
 @given(scenes())
 def test_success_or_an_error_of_ours(case: tuple[wy.Scene, float]) -> None:
     scene, step = case

@@ -153,12 +153,20 @@ class Model:
             kernel = "copy_vectors" if target.dtype == self.arrays.variant.vec3 else "copy_numbers"
             self.launch(kernel, target.shape[0], source=source, target=target)
 
-    def assemble(self, *, matrix: bool = True, mass: dict[str, wp.array] | None = None, **replaced: Any) -> None:
+    def assemble(
+        self,
+        *,
+        matrix: bool = True,
+        mass: dict[str, wp.array] | None = None,
+        explicit: tuple[str, ...] = (),
+        **replaced: Any,
+    ) -> None:
         """Fills forces, momentum, matrix and right-hand side from the state: the terms of the scene, in their order.
 
         Args:
             matrix: whether to fill the matrix.
             mass: arrays to take in place of the velocities for the momentum; D q̇ is then left out of it.
+            explicit: terms to leave out of the matrix, and their D q̇ out of the momentum.
             replaced: arrays to take in place of others for the right-hand side.
         """
         a = self.arrays
@@ -170,7 +178,7 @@ class Model:
         self.press()
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
-            self.launch(term.name, term.elements, matrix=int(matrix), **arrays)
+            self.launch(term.name, term.elements, matrix=int(matrix and term.name not in explicit), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def press(self) -> None:

@@ -18,7 +18,7 @@ from .system import System, gather
 
 CHUNK_BYTES = 1 << 24
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
-SMALLEST_PART = 2.0**-10
+SMALLEST_PART = 2.0**-7
 """Of a step: one that cannot be made is split in two, and its halves again, down to this."""
 
 
@@ -29,7 +29,8 @@ class Simulator:
         scene: the scene.
         step: h, time step [s], above 0.
         integrator: the method, by its name: "sdirk2" (order 2, strongly damped), "linear" (eq. 2 of the paper, order
-            1), "implicit-euler" (order 1) or "implicit-midpoint" (order 2, undamped); see ``warp_yarn/integrators``.
+            1), "implicit-euler" (order 1), "implicit-midpoint" (order 2, undamped) or "ros2" (order 2, for short
+            steps); see ``warp_yarn/integrators``.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
         preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (``kernels/incomplete.py``,

@@ -7,7 +7,8 @@ the model's state arrays; ``prepare_adjoint`` and ``retreat`` are its reverse (`
 from .implicit_euler import ImplicitEuler
 from .implicit_midpoint import ImplicitMidpoint
 from .linear import LinearlyImplicitEuler
+from .ros2 import ROS2
 from .sdirk2 import SDIRK2
 
-INTEGRATORS = {method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, ImplicitMidpoint, SDIRK2)}
+INTEGRATORS = {method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, ImplicitMidpoint, SDIRK2, ROS2)}
 """Every method by its name."""

@@ -66,12 +66,15 @@ class LinearlyImplicitEuler:
             a["euler_next"].grad = a["euler"].grad
         self.tape, self.anchor_tape = wp.Tape(), wp.Tape()
         with self.tape:
-            model.assemble()
-            model.prescribe()
+            self._record()
         with self.anchor_tape:
             model.drag_anchor("euler_next", "anchor_next")
         self._around = before, after
         self._backward = None
+
+    def _record(self) -> None:
+        self.model.assemble()
+        self.model.prescribe()
 
     def retreat(self) -> None:
         """Goes back over the step that ends at the present frame.
@@ -83,30 +86,37 @@ class LinearlyImplicitEuler:
             with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
                 before, after = self._around
                 before()
-                self._begin()
-                self._solve()
-                self.tape.backward()
+                self._reverse()
                 after()
             self._backward = capture.graph
         wp.capture_launch(self._backward)
 
-    def _begin(self) -> None:
-        """Recalls and assembles the step again, and takes friction's anchors back."""
-        model, a = self.model, self.model.arrays
-        model.launch("count", 1, by=-1)
-        model.launch("recall", "nodes")
-        model.take_inputs()
-        model.assemble()
+    def _reverse(self) -> None:
+        self._recall()
+        self.model.assemble()
+        self._reverse_anchors()
+        self.model.launch("adjoint_right_hand_side", "nodes")
+        self._solve()
+        self.tape.backward()
+
+    def _recall(self) -> None:
+        """The state that the step started from."""
+        self.model.launch("count", 1, by=-1)
+        self.model.launch("recall", "nodes")
+        self.model.take_inputs()
+
+    def _reverse_anchors(self) -> None:
+        """Takes friction's anchors back, first of all that the adjoints of an assembly gather."""
+        a = self.model.arrays
         a.zero_grad(*BETWEEN)
         if a["anchor"] is not None:
-            model.copy(anchor_next_grad="anchor_grad")
+            self.model.copy(anchor_next_grad="anchor_grad")
             a.zero_grad("anchor")
             self.anchor_tape.backward()
 
     def _solve(self) -> None:
         """λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
         model, a = self.model, self.model.arrays
-        model.launch("adjoint_right_hand_side", "nodes")
         model.factorize()
         multiplier = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
         model.solve(rhs=a["seed"], euler_rhs=a["euler_seed"], **multiplier)

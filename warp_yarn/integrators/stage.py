@@ -165,14 +165,14 @@ class StageMethod:
 
     def _iterate(self) -> None:
         a = self.model.arrays
-        wp.capture_if(a["refreshes"], on_true=self._refresh)
         wp.capture_if(a["solves"], on_true=self._solve_direction)
         self.model.launch("correct", "nodes")
-        self._evaluate(matrix=False)
+        wp.capture_if(
+            a["refreshes"],
+            on_true=lambda: self._evaluate(matrix=True),
+            on_false=lambda: self._evaluate(matrix=False),
+        )
         self._judge()
-
-    def _refresh(self) -> None:
-        self._evaluate(matrix=True)
 
     def _solve_direction(self) -> None:
         """δ, from A δ = r."""
