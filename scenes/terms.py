@@ -1,0 +1,81 @@
+"""What a scene does not need: how far each term, and sliding, moves the cloth, and what it costs.
+
+python scenes/terms.py                        the paper's 17 × 17 cloth in the wind, 50 steps of 0.5 ms
+python scenes/terms.py my_scene.py --step 1e-3 --steps 200
+
+The file is Python, and sets `scene` to a warp_yarn.Scene (and `state` to a warp_yarn.State to start from, if it likes):
+
+    import warp_yarn as wy
+    cloth = wy.paper.cloth("twill", rows=9, columns=9)
+    scene = wy.Scene(cloth, pins=cloth.corners("top"), sliding=True)
+
+The scene is run as it is, at half its step, and with each of its terms left out; pins and forces always stay. What
+moves the cloth by less than half the step does is lost in the error of the step anyway.
+"""
+
+from __future__ import annotations
+
+import argparse
+import runpy
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from common import command
+
+import warp_yarn as wy
+from warp_yarn import paper
+from warp_yarn.ablation import Ablation, ablate
+from warp_yarn.errors import whole
+from warp_yarn.integrators import INTEGRATORS
+
+
+def parser() -> argparse.ArgumentParser:
+    result = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    add = result.add_argument
+    add("file", nargs="?", type=Path, help="a Python file that sets `scene`; none: the paper's hung cloth")
+    add("--size", type=int, metavar="N", help="rows and columns of the paper's cloth (17)")
+    add("--steps", type=int, default=50, help="how many (%(default)s)")
+    add("--step", type=float, default=5e-4, metavar="SECONDS", help="time step (%(default)g)")
+    add("--integrator", choices=INTEGRATORS, help="(the simulator's default)")
+    add("--repeats", type=int, default=7, help="timed runs of each (%(default)s)")
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> Ablation:
+    """Measures, and tells what was found.
+
+    Raises:
+        InputError: an option or a file that cannot be used.
+        SimulationError: the scene itself cannot be simulated.
+    """
+    options = parser().parse_args(arguments)
+    scene, state = chosen(options)
+    method = {} if options.integrator is None else {"integrator": options.integrator}
+    steps, repeats = whole("--steps", options.steps, least=1), whole("--repeats", options.repeats, least=1)
+    found = ablate(scene, steps=steps, step=options.step, repeats=repeats, start=state, **method)
+    weave, cost = scene.cloth.weave, f"{1e3 * found.seconds:.3g} ms each"
+    print(f"{weave.rows} × {weave.columns} yarns, {steps} steps of {1e3 * options.step:g} ms, {cost}")
+    print("\n".join(found.lines()))
+    return found
+
+
+def chosen(options: argparse.Namespace) -> tuple[wy.Scene, wy.State | None]:
+    """The scene that the options name, and where it starts."""
+    if options.file is None:
+        size = 17 if options.size is None else options.size
+        return paper.hung_cloth(rows=size, columns=size), None
+    if options.size is not None:
+        raise wy.InputError(f"--size does not go with a file: {options.file} has its own cloth")
+    if not options.file.is_file():
+        raise wy.InputError(f"{options.file}: there is no such file")
+    names = runpy.run_path(str(options.file))
+    if not isinstance(names.get("scene"), wy.Scene):
+        raise wy.InputError(f"{options.file}: must set `scene` to a warp_yarn.Scene")
+    return names["scene"], names.get("state")
+
+
+if __name__ == "__main__":
+    sys.exit(command(main))
