@@ -1,0 +1,756 @@
+"""Learns parameters of a fabric from frames of its motion. Needs the extras ``torch`` and ``bench`` (SciPy).
+
+A ``Task`` is a least-squares problem: frames, a scene that is to reproduce them, and what may change in it within which
+ranges. ``learn`` solves it and says how sure the answer is. ``docs/learning.md`` tells how to read it.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import os
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import torch
+import tqdm
+
+from .arrays import STATE_TYPES
+from .cloth import Cloth
+from .errors import GradientError, InputError, SimulationError, finite_array, number, whole
+from .files import whole_file
+from .scene import Scene
+from .simulator import Simulator
+from .state import CLOTH_NUMBERS, FIELDS, Trajectory
+from .torch import Rollout
+
+# -- parameters -------------------------------------------------------------------------------------------------------
+
+OF_YARNS = ("density", "stretch", "bend")
+OF_CLOTHS = tuple(name for name in CLOTH_NUMBERS if name not in ("spacing", "radius"))
+OF_WINDS = {"wind_velocity": "velocity", "wind_density": "density", "wind_drag": "drag"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """What is to be learned, in its own unit.
+
+    Args:
+        name: "density[k]", "stretch[k]", "bend[k]" of material k; a number of the cloth, such as "shear" or "friction";
+            "wind_velocity[k]", "wind_density", "wind_drag", "gravity[k]" or "pin_stiffness", where the scene has them.
+        low, high: the range, its ends included; low below high.
+        start: where learning begins, in the range.
+    """
+
+    name: str
+    low: float
+    high: float
+    start: float
+
+    def __post_init__(self) -> None:
+        for end in ("low", "high", "start"):
+            number(f"{self.name}: {end}", getattr(self, end))
+        if not self.low < self.high:
+            raise InputError(f"{self.name}: low = {self.low:g}, must be below high = {self.high:g}")
+        if not self.low <= self.start <= self.high:
+            raise InputError(f"{self.name}: start = {self.start:g}, must be from {self.low:g} to {self.high:g}")
+
+
+PAPER = (
+    Parameter("density[0]", 1e-3, 3e-3, 2.25e-3),
+    Parameter("density[1]", 1e-3, 3e-3, 2.45e-3),
+    Parameter("stretch[0]", 0.0, 8e5, 3.35e5),
+    Parameter("stretch[1]", 0.0, 3e5, 1.45e5),
+    Parameter("bend[0]", 5e-5, 1.8e-4, 1.25e-4),
+    Parameter("bend[1]", 5e-5, 1.8e-4, 1.0e-4),
+    Parameter("shear", 0.0, 1200.0, 600.0),
+    Parameter("friction", 0.0, 1.0, 0.7),
+)
+"""What the paper learns, with ranges and starts."""
+
+
+def split(name: str) -> tuple[str, int | None]:
+    """``bend[1]`` as ("bend", 1), and ``shear`` as ("shear", None)."""
+    match = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", name)
+    if match is None:
+        raise InputError(f"parameter {name!r}, must be a name, or a name and an index such as 'bend[0]'")
+    return match[1], None if match[2] is None else int(match[2])
+
+
+def learnable(scene: Scene) -> dict[str, int | None]:
+    """What can be learned of a scene: the name, and how many numbers it has; None: one, which takes no index."""
+    result: dict[str, int | None] = {**dict.fromkeys(OF_YARNS, len(scene.cloth.yarns)), **dict.fromkeys(OF_CLOTHS)}
+    if scene.wind is not None:
+        result |= {"wind_velocity": 3, "wind_density": None, "wind_drag": None}
+    if scene.gravity is not None:
+        result["gravity"] = 3
+    if len(scene.pins) and scene.pin_stiffness is not None:
+        result["pin_stiffness"] = None
+    return result
+
+
+def value_of(scene: Scene, name: str) -> float:
+    """The scene's own value of a parameter, named as in ``Parameter``."""
+    base, k = split(name)
+    counts = learnable(scene)
+    if base not in counts:
+        raise InputError(f"parameter {name!r}, must be one that this scene has: {', '.join(counts)}")
+    count = counts[base]
+    if count is None and k is not None:
+        raise InputError(f"parameter {name!r}: {base} is one number, it takes no index")
+    if count is not None and (k is None or k >= count):
+        raise InputError(f"parameter {name!r}, must have an index from 0 to {count - 1}, such as '{base}[0]'")
+    if base in OF_YARNS:
+        return float(getattr(scene.cloth.yarns[k], base))
+    if base in OF_CLOTHS:
+        return float(getattr(scene.cloth, base))
+    value = getattr(scene.wind, OF_WINDS[base]) if base in OF_WINDS else getattr(scene, base)
+    return float(value if k is None else value[k])
+
+
+def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
+    """A copy of a scene with other values of these parameters, named as in ``Parameter``.
+
+    Raises:
+        InputError: a name that the scene does not have, or a value that it does not allow.
+    """
+    for name in values:
+        value_of(scene, name)
+    parts = {split(name): float(value) for name, value in values.items()}
+    old, result = scene.cloth, copy.copy(scene)
+    yarns = [
+        dataclasses.replace(yarn, **{base: value for (base, j), value in parts.items() if base in OF_YARNS and j == k})
+        for k, yarn in enumerate(old.yarns)
+    ]
+    numbers = {name: parts.get((name, None), getattr(old, name)) for name in CLOTH_NUMBERS}
+    result.cloth = Cloth(old.weave, yarns=yarns, warp=old.warp, weft=old.weft, pose=old.position, **numbers)
+    if scene.wind is not None:
+        velocity = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
+        rest = {OF_WINDS[name]: parts[name, None] for name in ("wind_density", "wind_drag") if (name, None) in parts}
+        result.wind = dataclasses.replace(scene.wind, velocity=velocity, **rest)
+    if scene.gravity is not None:
+        result.gravity = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
+    if ("pin_stiffness", None) in parts:
+        result.pin_stiffness = number("pin_stiffness", parts["pin_stiffness", None], above=0.0)
+    return result
+
+
+# -- the problem ------------------------------------------------------------------------------------------------------
+
+DIFFERENCE = 1e-4
+"""Width of differences of runs [ranges]: curvature adds some 1e-4 of a derivative to it, and what the solver leaves of
+runs, some 1e-8 of the motion, no more."""
+
+
+class Task:
+    """Frames, and a scene that is to reproduce them.
+
+    The model starts in the state of one of the frames (positions, velocities, (u, v), friction's anchors), and its
+    positions are compared with those of the frames after it. Methods take the values of the parameters, in their units
+    and in their order, as an array [parameters].
+
+    Args:
+        scene: the model; what is not learned keeps its values.
+        target: the frames.
+        parameters: what to learn.
+        frames: how many frames to compare with, at least 1; None: all that there are.
+        first: the frame to start from.
+        every: take only every so many-th frame after it (10: data at 0.1 ms as frames of 1 ms).
+        step: h of the model [s]; the time between compared frames must be a whole multiple of it. None: that time.
+        options: of the Simulator: integrator, tolerance, device, ...
+
+    Attributes:
+        initial: the state that the model starts in.
+        positions: what it is compared with [frames, nodes, 3] (m).
+        step: its step [s].
+        simulations: runs made so far, those that gradients begin with among them.
+        gradients: backward runs made so far.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        target: Trajectory,
+        parameters: Sequence[Parameter],
+        *,
+        frames: int | None = None,
+        first: int = 0,
+        every: int = 1,
+        step: float | None = None,
+        **options: Any,
+    ):
+        self.scene, self.parameters, self.options = scene, tuple(parameters), options
+        self.names = [p.name for p in self.parameters]
+        self.low, self.high, self.start = (
+            np.array([getattr(p, end) for p in self.parameters], dtype=np.float64) for end in ("low", "high", "start")
+        )
+        self._check_parameters()
+        chosen = self._chosen_frames(target, frames, first, every)
+        count = len(chosen) - 1
+        self.initial = target[int(chosen[0])]
+        self.positions = target.position[chosen[1:]].copy()
+        self.frame_time = target.step * every
+        self.steps_per_frame = 1 if step is None else self._steps_per_frame(number("step", step, above=0.0))
+        self.step = self.frame_time / self.steps_per_frame
+        after = np.arange(1, count + 1) * self.steps_per_frame
+        self.rollout = Rollout(scene, int(after[-1]), frames=after, step=self.step, **options)
+        self.rollout.simulator.state = self.initial  # to have it checked
+        self._state = {name: torch.as_tensor(getattr(self.initial, name)) for name in FIELDS}
+        self.simulations = self.gradients = 0
+
+    def _check_parameters(self) -> None:
+        if not self.names:
+            raise InputError("parameters is empty, must name at least one")
+        for name in self.names:
+            if self.names.count(name) > 1:
+                raise InputError(f"parameters names {name!r} twice")
+        for ends in (self.low, self.high):
+            self.scene_with(ends)
+
+    def _chosen_frames(self, target: Trajectory, frames: int | None, first: int, every: int) -> np.ndarray:
+        """Indices of the frame to start from and of those to compare with."""
+        ours, theirs = self.scene.cloth.weave, target.cloth.weave
+        if (ours.rows, ours.columns) != (theirs.rows, theirs.columns):
+            raise InputError(
+                f"target has {theirs.rows} × {theirs.columns} nodes, must have the scene's {ours.rows} × {ours.columns}"
+            )
+        for name in FIELDS:
+            shape = (len(target), self.scene.cloth.nodes, STATE_TYPES[name])
+            finite_array(f"target.{name}", getattr(target, name), shape)
+        first, every = whole("first", first, least=0), whole("every", every, least=1)
+        there = max(0, len(target) - 1 - first) // every
+        wanted = there if frames is None else whole("frames", frames, least=1)
+        if wanted > there or there == 0:
+            raise InputError(
+                f"frames = {wanted or 'all'}, first = {first}, every = {every}: the target has {len(target)} frames, "
+                f"which leaves {there} to compare with"
+            )
+        return first + every * np.arange(wanted + 1)
+
+    def _steps_per_frame(self, step: float) -> int:
+        frame = self.frame_time
+        result = round(frame / step)
+        # 1e-6: what decimal times and their quotient leave of a whole number
+        if result < 1 or abs(frame / step - result) > 1e-6:
+            raise InputError(f"step = {step:g} s, must fit a whole number of times into the {frame:g} s of a frame")
+        return result
+
+    def scene_with(self, values: np.ndarray) -> Scene:
+        """The scene with these values."""
+        return with_values(self.scene, dict(zip(self.names, values, strict=True)))
+
+    def _own(self, base: str) -> np.ndarray:
+        """The scene's own values of all numbers of this name."""
+        count = learnable(self.scene)[base]
+        if count is None:
+            return np.array(value_of(self.scene, base))
+        return np.array([value_of(self.scene, f"{base}[{k}]") for k in range(count)])
+
+    def _inputs(self, values: np.ndarray, differentiated: bool) -> dict[str, torch.Tensor]:
+        """What the rollout takes."""
+        arrays: dict[str, np.ndarray] = {}
+        for name, value in zip(self.names, values, strict=True):
+            base, k = split(name)
+            if base not in arrays:
+                arrays[base] = self._own(base)
+            arrays[base][() if k is None else k] = value
+        leaves = {name: torch.tensor(value, requires_grad=differentiated) for name, value in arrays.items()}
+        return {**self._state, **leaves}
+
+    def _run(self, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
+        """The residuals of a run."""
+        self.simulations += 1
+        offset = self.rollout(**inputs).position.double().cpu() - torch.as_tensor(self.positions)
+        return offset / np.sqrt(len(self.positions) * self.scene.cloth.nodes)
+
+    @torch.no_grad()
+    def residuals(self, values: np.ndarray) -> np.ndarray:
+        """(x − x̂)/√(frames·nodes), flat [frames·nodes·3] (m): their squares add up to the loss. One simulation.
+
+        Raises:
+            SimulationError: the model cannot be simulated with these values.
+        """
+        return self._run(self._inputs(values, differentiated=False)).numpy().ravel()
+
+    def loss(self, values: np.ndarray) -> float:
+        """Mean over frames and nodes of the squared distance to the data [m²]: the paper's 𝓛, of positions."""
+        residuals = self.residuals(values)
+        return float(residuals @ residuals)
+
+    def loss_and_gradient(self, values: np.ndarray) -> tuple[float, np.ndarray]:
+        """The loss, and its exact gradient by the adjoint, per unit of each parameter [parameters].
+
+        Raises:
+            SimulationError: the model cannot be simulated with these values.
+            GradientError: it can, but not differentiated.
+        """
+        inputs = self._inputs(values, differentiated=True)
+        loss = self._run(inputs).square().sum()
+        self.gradients += 1
+        loss.backward()
+        parts = [(inputs[base].grad, k) for base, k in map(split, self.names)]
+        return float(loss.detach()), np.array([float(part if k is None else part[k]) for part, k in parts])
+
+    def jacobian(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+        """∂residuals/∂y [residuals, parameters], y = (value − low)/(high − low), by differences: a run a parameter.
+
+        Args:
+            values: where.
+            residuals: there.
+
+        Raises:
+            SimulationError: the model can be simulated on neither side.
+        """
+        columns = []
+        for k, value in enumerate(values):
+            middle, width = 0.5 * (self.low[k] + self.high[k]), self.high[k] - self.low[k]
+            change = DIFFERENCE if value < middle else -DIFFERENCE
+            moved = values.copy()
+            try:
+                moved[k] = value + change * width
+                column = self.residuals(moved)
+            except SimulationError:
+                change = -change
+                moved[k] = value + change * width
+                if not self.low[k] <= moved[k] <= self.high[k]:
+                    raise
+                column = self.residuals(moved)
+            columns.append((column - residuals) / change)
+        return np.stack(columns, axis=1)
+
+    def trajectory(self, values: np.ndarray, frames: int | None = None, *, refine: int = 1) -> Trajectory:
+        """The model's motion with these values: the initial state, and frames as far apart as those compared.
+
+        Args:
+            frames: how many after the first; None: as many as are compared.
+            refine: how many times as short a step to take.
+
+        Raises:
+            SimulationError: a step that could not be made; its trajectory has every step before.
+        """
+        count = len(self.positions) if frames is None else whole("frames", frames, least=1)
+        every = self.steps_per_frame * whole("refine", refine, least=1)
+        # The kernels that learning has compiled, though nothing is differentiated.
+        options = {**self.options, "step": self.frame_time / every, "differentiable": True}
+        simulator = Simulator(self.scene_with(values), **options)
+        simulator.state = self.initial
+        motion = simulator.run(count * every)
+        parts = {name: getattr(motion, name)[::every] for name in FIELDS}
+        return dataclasses.replace(motion, step=self.frame_time, **parts)
+
+
+# -- the search -------------------------------------------------------------------------------------------------------
+
+ENOUGH = 0.03
+"""Learning ends where a full step would be shorter than this, in standard deviations of what is learned."""
+
+BAR = "{desc} {n_fmt} {elapsed}{postfix}"
+"""No bar but text, which fits beside eight values: nobody knows how many iterations it will take."""
+
+SHORTEST = 1e-7
+"""A step that is not worth a run [ranges]."""
+
+DETERMINED = 0.5 / np.sqrt(12.0)
+"""Standard deviation below which the data determine a parameter [ranges]: half of what the range alone says."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Iteration:
+    """What is known after an iteration; number 0 is the start.
+
+    Args:
+        values: of the parameters, in their units [parameters].
+        loss: at them [m²].
+        simulations, gradients: runs so far.
+        seconds: wall time so far; compiling, where kernels changed, is part of it.
+    """
+
+    values: np.ndarray
+    loss: float
+    simulations: int
+    gradients: int
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What was learned.
+
+    Args:
+        parameters: what was to be learned.
+        values: by name.
+        uncertainty: standard deviations, by name: what the data leave open (``uncertainties``) and the step's error.
+        step_error: by name, how much of the value is due to the model's time step, estimated (``step_errors``) from a
+            run with half the step; 0 where that run fails, and of what is not determined.
+        step_share: how much of the step's error the data do not have, from 0, data of the same method and step, to 1,
+            data of a continuous motion.
+        corrected: the values without the step's error, by name, within their ranges.
+        status: by name: "determined" or "not determined" by the data, and then ", at its lower bound" or ", at its
+            upper bound".
+        correlation: of the errors [parameters, parameters]; near ±1 where the data cannot tell two apart.
+        loss: at the values [m²].
+        gradient: of the loss, exact, with respect to (value − low)/(high − low) [parameters] (m²); NaN where it fails.
+        history: every iteration.
+        simulations, gradients, seconds: what it took, as of an Iteration; one run with half the step counts as two.
+        ended: why it ended.
+    """
+
+    parameters: tuple[Parameter, ...]
+    values: dict[str, float]
+    uncertainty: dict[str, float]
+    step_error: dict[str, float]
+    step_share: float
+    status: dict[str, str]
+    correlation: np.ndarray
+    loss: float
+    gradient: np.ndarray
+    history: list[Iteration]
+    simulations: int
+    gradients: int
+    seconds: float
+    ended: str
+
+    @property
+    def corrected(self) -> dict[str, float]:
+        without = {p.name: self.values[p.name] - self.step_error[p.name] for p in self.parameters}
+        return {p.name: float(np.clip(without[p.name], p.low, p.high)) for p in self.parameters}
+
+
+def learn(
+    task: Task,
+    *,
+    iterations: int = 100,
+    resolution: float = 1e-9,
+    checkpoint: str | os.PathLike | None = None,
+    progress: bool = False,
+    watch: Callable[[Iteration], None] = lambda iteration: None,
+) -> Result:
+    """Minimizes a task's loss within the ranges, by the method of Levenberg and Marquardt.
+
+    The Jacobian comes from differences of runs; each step then corrects it by what it saw (Broyden), and differences
+    are taken again where it predicted badly, and at the end. ``benchmarks/optimizers.py`` has other methods.
+
+    Args:
+        iterations: at most.
+        resolution: how far the data's positions may be off at least, root mean square [m], above 0. Learning ends where
+            the model is as near as that, and a parameter that moves positions by less is left where it is.
+        checkpoint: a file, ending in .npz, that is written after every iteration. Where it is there already, learning
+            goes on from it, and ends where it would have ended without the interruption.
+        progress: show a bar with the loss and the values, on a terminal.
+        watch: called after every iteration.
+
+    Raises:
+        InputError: an argument out of its range, or a checkpoint of another task.
+        SimulationError: the model cannot be simulated with the start values. A later step to such values is shortened.
+    """
+    whole("iterations", iterations, least=0)
+    search = _Search(task, number("resolution", resolution, above=0.0))
+    path = None if checkpoint is None else Path(checkpoint)
+    if path is not None and path.suffix != ".npz":
+        raise InputError(f"checkpoint = {str(checkpoint)!r}, must end in .npz")
+    # The first run compiles the kernels where they changed, which takes many seconds, and says so meanwhile.
+    with tqdm.tqdm(desc="compiling", bar_format=BAR, disable=None if progress else True) as bar:
+        if path is not None and path.exists():
+            search.load(path)
+        else:
+            search.begin()
+        watch(search.history[-1])
+        bar.set_description("learning", refresh=False)
+        ended = None
+        while ended is None:
+            bar.set_postfix_str(search.describe(), refresh=False)
+            bar.update(len(search.history) - 1 - bar.n)
+            if len(search.history) > iterations:
+                ended = f"after {len(search.history) - 1} iterations"
+                break
+            ended = search.advance()
+            if ended is None:
+                if path is not None:
+                    search.save(path)
+                watch(search.history[-1])
+    return search.result(ended)
+
+
+class _Search:
+    """Where learning is: y = (value − low)/(high − low), the residuals there, and the Jacobian as far as known."""
+
+    def __init__(self, task: Task, resolution: float):
+        self.task, self.resolution = task, resolution
+        self.y = (task.start - task.low) / (task.high - task.low)
+        self.residuals = np.zeros(0)
+        self.jacobian: np.ndarray | None = None
+        self.fresh = False  # whether the Jacobian is of differences taken here
+        self.damping = 1e-3
+        self.scale = np.zeros(len(self.y))  # the largest norm of each column so far, as Marquardt scales
+        self.history: list[Iteration] = []
+        self.began = time.perf_counter()
+
+    @property
+    def values(self) -> np.ndarray:
+        return self._physical(self.y)
+
+    def _physical(self, y: np.ndarray) -> np.ndarray:
+        return self.task.low + y * (self.task.high - self.task.low)
+
+    @property
+    def loss(self) -> float:
+        return float(self.residuals @ self.residuals)
+
+    def begin(self) -> None:
+        self.residuals = self.task.residuals(self.values)
+        self._note()
+
+    def _note(self) -> None:
+        seconds = time.perf_counter() - self.began
+        self.history.append(Iteration(self.values, self.loss, self.task.simulations, self.task.gradients, seconds))
+
+    def describe(self) -> str:
+        values: dict[str, str] = {}
+        for name, value in zip(self.task.names, self.values, strict=True):
+            base = split(name)[0]
+            values[base] = values.get(base, base) + f" {value:.3g}"
+        return ", ".join((f"loss {self.loss:.1e}", *values.values()))
+
+    def advance(self) -> str | None:
+        """An iteration: a step that lowers the loss. Returns why there is none, where there is none."""
+        while True:
+            if self.loss <= self.resolution**2:
+                return "as near to the data as their resolution"
+            if self.jacobian is None:
+                self._differentiate()
+            _, gain = self._step(0.0)
+            if gain > ENOUGH**2 * residual_variance(self._field(self.residuals), len(self.y), self.resolution):
+                if self._try():
+                    return None
+                if self.fresh:
+                    return "no step lowers the loss"
+            elif self.fresh:
+                return "converged"
+            self.jacobian = None
+
+    def _differentiate(self) -> None:
+        self.jacobian = self.task.jacobian(self.values, self.residuals)
+        self.fresh = True
+        self.scale = np.maximum(self.scale, np.linalg.norm(self.jacobian, axis=0))
+
+    def _step(self, damping: float) -> tuple[np.ndarray, float]:
+        """The step within the ranges that lowers the linearized and damped loss most, and how much it lowers the loss.
+
+        Beside the damping of Levenberg and Marquardt there is that of the range: what would move positions by less than
+        they tell, noise of the residuals' size or their resolution, over all of its range, stays where it is.
+        """
+        range_damping = 12.0 * max(self.loss / len(self.residuals), self.resolution**2)
+        q, r = np.linalg.qr(self.jacobian)
+        a = np.vstack([r, np.diag(np.sqrt(damping * self.scale**2 + range_damping))])
+        b = np.concatenate([-(q.T @ self.residuals), np.zeros(len(self.y))])
+        found = scipy.optimize.lsq_linear(a, b, bounds=(-self.y, 1.0 - self.y), method="bvls")
+        step = np.clip(self.y + found.x, 0.0, 1.0) - self.y
+        after = self.residuals + self.jacobian @ step
+        return step, self.loss - float(after @ after)
+
+    def _try(self) -> bool:
+        """Steps, ever shorter until the loss falls. False: it did not, as far as this Jacobian goes."""
+        while True:
+            step, predicted = self._step(self.damping)
+            if np.abs(step).max() < SHORTEST:
+                return False
+            try:
+                residuals = self.task.residuals(self._physical(self.y + step))
+                quality = (self.loss - float(residuals @ residuals)) / predicted
+            except SimulationError:
+                quality = -np.inf
+            if quality > 1e-3:
+                break
+            if not self.fresh:
+                return False
+            self.damping *= 10.0
+        surprise = residuals - self.residuals - self.jacobian @ step
+        self.y, self.residuals = self.y + step, residuals
+        self.fresh = False
+        if quality < 0.25:
+            self.damping *= 4.0
+            self.jacobian = None
+        else:
+            # in Marquardt's scaling: what moves nothing is not to blame
+            along = self.scale**2 * step
+            self.jacobian = self.jacobian + np.outer(surprise, along) / (along @ step)
+        if quality > 0.5:
+            self.damping = max(0.1 * self.damping, 1e-12)
+        self._note()
+        return True
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def _identity(self) -> dict[str, np.ndarray]:
+        """What a checkpoint must agree with."""
+        return {
+            "names": np.array(self.task.names),
+            "low": self.task.low,
+            "high": self.task.high,
+            "start": self.task.start,
+            "resolution": np.array(self.resolution),
+        }
+
+    def save(self, path: Path) -> None:
+        history = {field: np.array([getattr(i, field) for i in self.history]) for field in _OF_ITERATIONS}
+        known = np.zeros((0, len(self.y))) if self.jacobian is None else self.jacobian
+        state = {"y": self.y, "damping": self.damping, "scale": self.scale, "jacobian": known}
+        with whole_file(path) as temporary, open(temporary, "wb") as file:
+            np.savez(file, **self._identity(), **state, **{f"history_{name}": rows for name, rows in history.items()})
+
+    def load(self, path: Path) -> None:
+        """Goes on from a checkpoint. Its loss, computed again, must be what it was: then the task is the same."""
+        try:
+            with np.load(path) as data:
+                same = all(np.array_equal(data[name], value) for name, value in self._identity().items())
+                y, damping, scale, known = (data[name] for name in ("y", "damping", "scale", "jacobian"))
+                rows = zip(*(data[f"history_{name}"].tolist() for name in _OF_ITERATIONS), strict=True)
+                history = [Iteration(np.array(values), *rest) for values, *rest in rows]
+                last = history[-1]
+        except Exception as error:  # zip, pickle and key errors of a foreign or truncated file
+            raise InputError(f"{path}: not a checkpoint of learning ({error}); remove it to begin anew") from error
+        if not same:
+            raise InputError(f"{path}: of other parameters, ranges, starts or resolution; remove it to begin anew")
+        self.y, self.damping, self.scale, self.history = y, float(damping), scale, history
+        self.jacobian = known if len(known) else None
+        self.residuals = self.task.residuals(self.values)
+        # 1e-6: another processor may round otherwise
+        if not np.isclose(self.loss, last.loss, rtol=1e-6, atol=0.0):
+            raise InputError(
+                f"{path}: of another task: it has a loss of {last.loss:.6e} m² where this one has {self.loss:.6e} m²; "
+                "remove it to begin anew"
+            )
+        self.task.simulations, self.task.gradients = last.simulations, last.gradients
+        self.began = time.perf_counter() - last.seconds
+
+    # -- the answer --------------------------------------------------------------------------------------------------
+
+    def result(self, ended: str) -> Result:
+        task, width = self.task, self.task.high - self.task.low
+        if not self.fresh:
+            self._differentiate()
+        shift, rest, share = step_errors(self.jacobian, self.residuals, self._missed_by_the_step(), self.resolution)
+        # what neither the parameters nor the step explain
+        variance = residual_variance(self._field(self.residuals + share * rest), len(self.y), self.resolution)
+        covariance = uncertainties(self.jacobian, variance)
+        deviation = np.sqrt(np.diag(covariance))
+        step_error = np.where(deviation < DETERMINED, share * shift, 0.0)
+        try:
+            _, gradient = task.loss_and_gradient(self.values)
+        except GradientError:  # of steps that could only be made in parts
+            gradient = np.full(len(self.y), np.nan)
+
+        def by_name(values: np.ndarray) -> dict[str, float]:
+            return dict(zip(task.names, values.tolist(), strict=True))
+
+        return Result(
+            parameters=task.parameters,
+            values=by_name(self.values),
+            uncertainty=by_name(np.hypot(deviation, step_error) * width),
+            step_error=by_name(step_error * width),
+            step_share=share,
+            status={name: _status(*of) for name, *of in zip(task.names, self.y, deviation, strict=True)},
+            correlation=covariance / np.outer(deviation, deviation),
+            loss=self.loss,
+            gradient=gradient * width,
+            history=self.history,
+            simulations=task.simulations,
+            gradients=task.gradients,
+            seconds=time.perf_counter() - self.began,
+            ended=ended,
+        )
+
+    def _field(self, residuals: np.ndarray) -> np.ndarray:
+        """Residuals as [frames, rows, columns, 3]."""
+        weave = self.task.scene.cloth.weave
+        return residuals.reshape(-1, weave.rows, weave.columns, 3)
+
+    def _missed_by_the_step(self) -> np.ndarray:
+        """Estimate of what the residuals at these values would gain if the step went to 0 [residuals]; 0 if unknown."""
+        task = self.task
+        task.simulations += 2
+        try:
+            finer = task.trajectory(self.values, refine=2).position[1:]
+        except SimulationError:
+            return np.zeros(len(self.residuals))
+        offset = (finer - task.positions).ravel() / np.sqrt(len(task.positions) * task.scene.cloth.nodes)
+        power = 2.0**task.rollout.simulator.integrator.order
+        return (offset - self.residuals) * power / (power - 1.0)
+
+
+_OF_ITERATIONS = tuple(field.name for field in dataclasses.fields(Iteration))
+
+
+def _status(y: float, deviation: float) -> str:
+    bound = {0.0: ", at its lower bound", 1.0: ", at its upper bound"}.get(float(y), "")
+    return ("determined" if deviation < DETERMINED else "not determined") + bound
+
+
+def uncertainties(jacobian: np.ndarray, variance: float) -> np.ndarray:
+    """What least squares leaves open: the covariance (JᵀJ/s² + 12)⁻¹ of parameters in units of their ranges [p, p].
+
+    JᵀJ is the Gauss-Newton Hessian. 12 is the range's part: a uniform distribution over it has the variance 1/12, which
+    a parameter keeps that the data do not see.
+
+    Args:
+        jacobian: J, of the residuals with respect to the p parameters [residuals, p] (m).
+        variance: s², of a residual that counts as one of so many as there are (``residual_variance``) [m²].
+    """
+    return np.linalg.inv(jacobian.T @ jacobian / variance + 12.0 * np.eye(jacobian.shape[1]))
+
+
+def residual_variance(residuals: np.ndarray, parameters: int, resolution: float) -> float:
+    """s² = max(|r|²/max(n − p, 1), resolution²) of residuals r [frames, rows, columns, 3] (m), their number n [m²].
+
+    n counts independent residuals (``independent``): data that differ from the model by noise have as many as numbers,
+    data that differ by what the model cannot do have few.
+    """
+    return max(float((residuals**2).sum()) / max(independent(residuals) - parameters, 1.0), resolution**2)
+
+
+def step_errors(
+    jacobian: np.ndarray, residuals: np.ndarray, missed: np.ndarray, resolution: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """What a model's time step puts into values that were learned with it, to first order.
+
+    Let e be what the residuals would gain with a step of 0. As far as the data are without the step's error, least
+    squares has put A e into the values, A = (JᵀJ + 12 resolution²)⁻¹ Jᵀ, and could not put e − J A e, whose opposite
+    then stands in the residuals. How much of it does is taken for how much of e the data are without: its share.
+
+    Args:
+        jacobian: J [residuals, p] (m), of p parameters in units of their ranges.
+        residuals: [residuals] (m).
+        missed: e [residuals] (m).
+        resolution: of the data [m].
+
+    Returns:
+        A e [p], in ranges; e − J A e [residuals] (m); and the share, from 0 to 1.
+    """
+    square = jacobian.T @ jacobian + 12.0 * resolution**2 * np.eye(jacobian.shape[1])
+    shift = np.linalg.solve(square, jacobian.T @ missed)
+    rest = missed - jacobian @ shift
+    share = np.clip(-(residuals @ rest) / max(rest @ rest, np.finfo(float).tiny), 0.0, 1.0)
+    return shift, rest, float(share)
+
+
+def independent(residuals: np.ndarray) -> float:
+    """How many of these residuals [frames, rows, columns, 3] are independent.
+
+    Along an axis of n, with a correlation ρ of neighbours, n (1 − ρ)/(1 + ρ), and 1 at the least: their mean is as sure
+    as that of n whose correlation falls by ρ from each to the next. A negative ρ counts as 0.
+    """
+    result = float(residuals.shape[3])
+    square = float((residuals**2).mean())
+    for axis in range(3):
+        n = residuals.shape[axis]
+        correlation = 0.0
+        if n > 1 and square > 0.0:
+            here, next = (np.take(residuals, range(k, n - 1 + k), axis) for k in (0, 1))
+            correlation = np.clip((here * next).mean() / square, 0.0, 1.0)
+        result *= max(1.0, n * (1.0 - correlation) / (1.0 + correlation))
+    return result
