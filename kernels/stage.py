@@ -3,9 +3,9 @@
     r(w) = η F(q, w) + M(q) (v₀ − w) = 0,   q = q₀ + η w
 
 Every implicit method here is made of such stages, and of q₀ + t w and v₀ + k (w − v₀) that carry one to the next or to
-the end of a step (``warp_yarn/integrators``). Newton's iteration takes A, the symmetric
-positive definite part of −∂r/∂w, for its matrix: M + η D + η² H. The adjoint of a stage that has converged is
-(−∂r/∂w)ᵀ λ = w̄, with the exact derivative: ρ = w̄ + (∂r/∂w)ᵀ λ is driven to 0 with the same A.
+the end of a step (``warp_yarn/integrators``). Newton's iteration takes A, the symmetric positive definite part of
+−∂r/∂w, for its matrix: M + η D + η² H. The adjoint of a stage that has converged is (−∂r/∂w)ᵀ λ = w̄, with the exact
+derivative: ρ = w̄ + (∂r/∂w)ᵀ λ is driven to 0 with the same A.
 """
 
 import functools
@@ -24,6 +24,11 @@ SHORTEST_STEP = 2.0**-24
 be short indeed."""
 NEAREST = 0.1
 """Part of a Δs that a step of the iteration leaves of it at least."""
+TURNED = 0.9
+"""Part of the slope that a step of the iteration may turn to with the other sign (``integrators/stage.py``)."""
+SLOW = 0.3
+"""Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
+matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
 ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
 """Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
 COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
@@ -179,11 +184,11 @@ def define(variant: Variant) -> SimpleNamespace:
         if wp.static(sliding):
             ordered = shortest[0] > scalar(0.0)
             shortest[0] = scalar(wp.static(1.0e30))
-        if first or (ordered and (now < before or turned > scalar(-0.9) * slope[0])):
+        if first or (ordered and (now < before or turned > scalar(-TURNED) * slope[0])):
             if not first:
                 newton_iterations[0] = newton_iterations[0] + 1
                 # a step that hardly helps: the matrix is of another state
-                if now > scalar(0.3) * before:
+                if now > scalar(SLOW) * before:
                     refreshes[0] = 1
             # what no longer falls, and is less than positions can tell, is rounding
             settled = not first and now > scalar(0.5) * before and now <= rounding
