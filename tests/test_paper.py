@@ -48,8 +48,8 @@ def test_friction_of_the_ground_truth_is_coulombs(weave):
     simulator = wy.Simulator(hard)
     state = wy.State(position, euler, np.zeros_like(position), rates)
     limit = cloth.friction * simulator.contact(state)[1][:, None]
-    # As far as a crossing drags its anchor.
-    delta = rng.uniform(-1.0, 1.0, size=euler.shape) * limit / cloth.friction_stiffness
+    # As far as the spring is straight: in the last tenth before its limit it bends over to it (kernels/friction.py).
+    delta = rng.uniform(-0.89, 0.89, size=euler.shape) * limit / cloth.friction_stiffness
     forces = simulator.forces(dataclasses.replace(state, anchor=euler - delta))
     found = forces.pop("friction")[1][crossing]
     others = sum(along for _, along in forces.values())[crossing]
