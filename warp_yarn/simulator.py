@@ -181,32 +181,31 @@ class Simulator:
 
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
-        self._parts: list[float] = []
         self._upload(self._frame(frame))
-        made = all(self._part(frame, 0.5 * k, 0.5) for k in range(2))
+        smallest = self._halves(frame, 0.0, 1.0)
         self.integrator.set_times(self.step_size, self.step_size)
-        if made:
-            self.split_steps[self.steps_done + frame + 1] = min(self._parts) * self.step_size
+        if smallest:
+            self.split_steps[self.steps_done + frame + 1] = smallest * self.step_size
             self._count(frame + 1)
-        else:
-            self.arrays["status"].assign(self._failed)
-        return made
+        return smallest > 0.0
 
-    def _part(self, frame: int, done: float, size: float) -> bool:
-        """Makes a part of a step, of which so much is done, or its two halves."""
+    def _halves(self, frame: int, done: float, size: float) -> float:
+        """Makes a part of a step, of which so much is done, in two; the smallest part made, 0 where one failed."""
+        half = 0.5 * size
+        first = self._part(frame, done, half)
+        return min(first, self._part(frame, done + half, half)) if first else 0.0
+
+    def _part(self, frame: int, done: float, size: float) -> float:
+        """Makes a part of a step, at once or in halves; the smallest part made, 0 where one failed."""
         before, step = self.state, self.step_size
         self._count(frame)
         self.arrays.zero("status")
         self.integrator.set_times(size * step, (1.0 - done) * step)
         self.integrator.advance()
-        self._failed = self.arrays["status"].numpy().copy()
-        self.arrays.zero("status")
-        if not self._failed[0]:
-            self._parts.append(size)
-            return True
+        if not self.arrays["status"].numpy()[0]:
+            return size
         self._upload(before)
-        half = 0.5 * size
-        return half >= SMALLEST_PART and self._part(frame, done, half) and self._part(frame, done + half, half)
+        return self._halves(frame, done, size) if 0.5 * size >= SMALLEST_PART else 0.0
 
     def run(self, steps: int, *, progress: bool = False) -> Trajectory:
         """Makes steps and returns every frame, the present one first.

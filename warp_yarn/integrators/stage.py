@@ -59,11 +59,8 @@ class StageMethod:
             a[name] = a.zeros(1, scalar)
         rate = self.carried / self.fraction
         numbers = {"carried_rate": rate, "unit": 1.0, "step_length": 1.0, "shortest": 1e30}
-        for name, value in {
-            **numbers,
-            "newton_tolerance": model.newton_tolerance,
-            "inner_tolerance": INNER_TOLERANCE,
-        }.items():
+        numbers |= {"newton_tolerance": model.newton_tolerance, "inner_tolerance": INNER_TOLERANCE}
+        for name, value in numbers.items():
             a[name] = a.numbers(value)
         self.set_times(model.step_size, model.step_size)
         self._graphs: dict[str, Any] = {}
