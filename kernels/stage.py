@@ -29,6 +29,9 @@ TURNED = 0.9
 SLOW = 0.3
 """Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
+TURNING = 0.03
+"""Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one iteration
+did with that of the first stage, above 0.045, two to seven, and one or two with its own (5 × 5 and 17 × 17)."""
 ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
 """Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
 COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
@@ -196,6 +199,7 @@ def define(variant: Variant) -> SimpleNamespace:
             before = now
             if now <= newton_tolerance[0] * scale or settled:
                 continues[0] = 0
+                refreshes[0] = 0
         else:
             solves[0] = 0
             refreshes[0] = 1
@@ -250,6 +254,20 @@ def define(variant: Variant) -> SimpleNamespace:
         allowed = rest * scalar(wp.static(1.0 - NEAREST))
         if loss > allowed and rest > scalar(0.0):
             wp.atomic_min(step_length, 0, allowed / loss)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def ask_for_matrix(
+        segment_nodes: wp.array(dtype=wp.vec2i),
+        step_size: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
+        solution: wp.array(dtype=vec3),
+        refreshes: wp.array(dtype=int),
+    ):
+        """Asks for a new matrix where a yarn turns in the step."""
+        e = wp.tid()
+        moved = wp.length(solution[segment_nodes[e][1]] - solution[segment_nodes[e][0]]) * step_size[0]
+        if moved > scalar(wp.static(TURNING)) * spacing[0]:
+            refreshes[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def next_base(
@@ -411,6 +429,7 @@ def define(variant: Variant) -> SimpleNamespace:
         judge=judge,
         shortest_segment=shortest_segment,
         keep_order=keep_order,
+        ask_for_matrix=ask_for_matrix,
         next_base=next_base,
         recall_first_stage=recall_first_stage,
         recall_carried_stage=recall_carried_stage,

@@ -95,8 +95,9 @@ class StageMethod:
         self._begin()
         for stage in range(self.stages):
             if stage:
+                model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
-            self._newton(fresh=stage == 0)
+            self._newton(first=stage == 0)
         if self._is_carried:
             model.launch("next_base", "nodes", start=None)
             self.model.copy(
@@ -146,14 +147,24 @@ class StageMethod:
         mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
         self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
 
-    def _newton(self, *, fresh: bool) -> None:
-        """Solves the stage. Its matrix is that of the step's first stage until convergence is slow: another state's
-        differs less from it than it differs from the exact derivative."""
+    def _newton(self, *, first: bool) -> None:
+        """Solves the stage. Its matrix is that of its start until convergence is slow: another state's differs less from
+        it than it differs from the exact derivative. A second stage does with the first's where yarns hardly turn."""
         a = self.model.arrays
         a.zero("tries", "direction", "euler_direction")
-        self._evaluate(matrix=fresh)
+        if first:
+            self._evaluate(matrix=True)
+        else:
+            self._evaluate_as_asked()
         self._judge()
         wp.capture_while(a["continues"], self._iterate)
+
+    def _evaluate_as_asked(self) -> None:
+        wp.capture_if(
+            self.model.arrays["refreshes"],
+            on_true=lambda: self._evaluate(matrix=True),
+            on_false=lambda: self._evaluate(matrix=False),
+        )
 
     def _judge(self) -> None:
         if self.model.scene.sliding:
@@ -164,11 +175,7 @@ class StageMethod:
         a = self.model.arrays
         wp.capture_if(a["solves"], on_true=self._solve_direction)
         self.model.launch("correct", "nodes")
-        wp.capture_if(
-            a["refreshes"],
-            on_true=lambda: self._evaluate(matrix=True),
-            on_false=lambda: self._evaluate(matrix=False),
-        )
+        self._evaluate_as_asked()
         self._judge()
 
     def _solve_direction(self) -> None:
