@@ -30,8 +30,8 @@ SLOW = 0.3
 """Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
 TURNING = 0.03
-"""Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one iteration
-did with that of the first stage, above 0.045, two to seven, and one or two with its own (5 × 5 and 17 × 17)."""
+"""Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one
+iteration did with that of the first stage, above 0.045, two to seven, and one or two with its own (17 × 17)."""
 ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
 """Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
 COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}

@@ -14,6 +14,7 @@ from warp_yarn.ablation import ablate
 
 solver = load("benchmarks/solver.py")
 work = load("benchmarks/work_precision.py")
+equal = load("benchmarks/equal_error.py")
 sizes = load("benchmarks/sizes.py")
 bandwidth = load("benchmarks/bandwidth.py")
 terms = load("benchmarks/terms.py")
@@ -157,6 +158,27 @@ def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
     with open(tmp_path / "wp_summary.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == curves
     assert "of that from" in capsys.readouterr().out
+
+
+# -- benchmarks/equal_error.py ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order, target", [(1, 1e-2), (2, 1e-3), (1, 1.0)])
+def test_the_largest_step_that_reaches_an_error_is_found(monkeypatch, order, target):
+    monkeypatch.setattr(equal, "error", lambda motion, size, method, steps, converged: (2.0 / steps) ** order)
+    motion = equal.MOTIONS["hung"]
+    found, never = equal.steps_to(motion, 5, "linear", (target, 1e-9), None)
+    # 3 % more steps than needed at most, or one; 25 ms begin with 5 steps
+    needed = max(5.0, 2.0 / target ** (1.0 / order))
+    assert needed <= found <= max(1.031 * needed, needed + 1.0)
+    assert never is None
+
+
+def test_methods_are_timed_beside_each_other():
+    motion = equal.MOTIONS["hung"]
+    seconds = equal.side_by_side(motion, 3, {"linear": 50, "sdirk2": 5}, repeats=2)
+    assert [len(times) for times in seconds.values()] == [2, 2]
+    assert min(map(min, seconds.values())) > 0.0
 
 
 # -- benchmarks/sizes.py ----------------------------------------------------------------------------------------------

@@ -148,8 +148,9 @@ class StageMethod:
         self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
 
     def _newton(self, *, first: bool) -> None:
-        """Solves the stage. Its matrix is that of its start until convergence is slow: another state's differs less from
-        it than it differs from the exact derivative. A second stage does with the first's where yarns hardly turn."""
+        """Solves the stage. Its matrix is that of its start until convergence is slow: another state's differs less
+        from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
+        turn."""
         a = self.model.arrays
         a.zero("tries", "direction", "euler_direction")
         if first:
