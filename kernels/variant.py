@@ -55,7 +55,7 @@ class Term:
 
     name: str
     elements: str
-    """What the kernel runs over: nodes, crossings, segments, bends, corners, triangles or pins."""
+    """What the kernel runs over: nodes, crossings, segments, bends, triangles or pins."""
     define: Callable[[Variant], wp.Kernel]
     energy: Callable[[Variant], wp.Kernel] | None = None
     """The kernel that adds up the term's energy, where it has one."""
