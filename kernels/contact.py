@@ -18,6 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Variant
 
 FADING = 0.05
@@ -135,13 +136,14 @@ def define_normal(variant: Variant) -> wp.Kernel:
         position: wp.array(dtype=vec3),
         normal: wp.array(dtype=vec3),
     ):
-        i = crossing_node[wp.tid()]
-        neighbours = crossing_neighbours[wp.tid()]
+        e = index(wp.tid())
+        i = index(crossing_node[e])
+        neighbours = crossing_neighbours[e]
         # Differences to the crossing, not positions: far from the origin their products would lose every digit.
-        left = position[neighbours[0]] - position[i]
-        right = position[neighbours[1]] - position[i]
-        up = position[neighbours[2]] - position[i]
-        down = position[neighbours[3]] - position[i]
+        left = position[index(neighbours[0])] - position[i]
+        right = position[index(neighbours[1])] - position[i]
+        up = position[index(neighbours[2])] - position[i]
+        down = position[index(neighbours[3])] - position[i]
         total = left + right + up + down
         covariance = wp.outer(left, left) + wp.outer(right, right) + wp.outer(up, up) + wp.outer(down, down)
         covariance -= wp.outer(total, total) * scalar(0.2)

@@ -23,6 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 FLOOR = 1.0e-7
@@ -109,7 +110,8 @@ def define(variant: Variant) -> wp.Kernel:
         weights: wp.array(dtype=vec3),
         diagonal_ss: wp.array(dtype=scalar),
     ):
-        i = crossing_node[wp.tid()]
+        e = index(wp.tid())
+        i = index(crossing_node[e])
         limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
         floor = friction_stiffness[0] * spacing[0] * scalar(wp.static(FLOOR))
         for direction in range(2):
@@ -146,7 +148,8 @@ def define_anchor(variant: Variant) -> wp.Kernel:
         anchor_next: wp.array(dtype=scalar),
     ):
         """s̄ after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
-        i = crossing_node[wp.tid()]
+        e = index(wp.tid())
+        i = index(crossing_node[e])
         reach = friction[0] * wp.max(contact_load[i], scalar(0.0)) / friction_stiffness[0]
         for direction in range(2):
             s = 2 * i + direction

@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import vanishing
+from .indexing import index
 from .variant import Term, Variant
 
 OF_CURVATURE = 0.8
@@ -193,12 +194,13 @@ def define(variant: Variant) -> wp.Kernel:
         diagonal_xx: wp.array(dtype=mat33),
         upper_xx: wp.array(dtype=mat33),
     ):
-        c = crossing_node[wp.tid()]
-        left = crossing_neighbours[wp.tid()][0]
-        right = crossing_neighbours[wp.tid()][1]
-        up = crossing_neighbours[wp.tid()][2]
-        down = crossing_neighbours[wp.tid()][3]
-        jams = corner_jams[wp.tid()]
+        e = index(wp.tid())
+        c = index(crossing_node[e])
+        left = index(crossing_neighbours[e][0])
+        right = index(crossing_neighbours[e][1])
+        up = index(crossing_neighbours[e][2])
+        down = index(crossing_neighbours[e][3])
+        jams = corner_jams[e]
         unit = spacing[0]
         ratio = unit / radius[0]
         angle = lock_angle[0]
@@ -267,15 +269,15 @@ def define(variant: Variant) -> wp.Kernel:
             wp.atomic_add(diagonal_xx, up, uu)
             wp.atomic_add(diagonal_xx, down, dd)
             wp.atomic_add(diagonal_xx, c, -(lc + rc + uc + dc))
-            wp.atomic_add(upper_xx, stencil * left, lc)
-            wp.atomic_add(upper_xx, stencil * c, wp.transpose(rc))
-            wp.atomic_add(upper_xx, stencil * up + 1, uc)
-            wp.atomic_add(upper_xx, stencil * c + 1, wp.transpose(dc))
-            blocks = corner_blocks[wp.tid()]
-            wp.atomic_add(upper_xx, blocks[0], ul)
-            wp.atomic_add(upper_xx, blocks[1], wp.transpose(dl))
-            wp.atomic_add(upper_xx, blocks[2], ur)
-            wp.atomic_add(upper_xx, blocks[3], wp.transpose(dr))
+            wp.atomic_add(upper_xx, index(stencil * left), lc)
+            wp.atomic_add(upper_xx, index(stencil * c), wp.transpose(rc))
+            wp.atomic_add(upper_xx, index(stencil * up + 1), uc)
+            wp.atomic_add(upper_xx, index(stencil * c + 1), wp.transpose(dc))
+            blocks = corner_blocks[e]
+            wp.atomic_add(upper_xx, index(blocks[0]), ul)
+            wp.atomic_add(upper_xx, index(blocks[1]), wp.transpose(dl))
+            wp.atomic_add(upper_xx, index(blocks[2]), ur)
+            wp.atomic_add(upper_xx, index(blocks[3]), wp.transpose(dr))
 
     return shear_term
 

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -66,15 +67,16 @@ def define(variant: Variant) -> wp.Kernel:
         upper_sx: wp.array(dtype=vec3),
         upper_ss: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
         d = position[b] - position[a]
-        k = stretch_stiffness(stretch[segment_yarn[e]], radius[0])
+        k = stretch_stiffness(stretch[yarn], radius[0])
 
         f = stretch_force(d, rest, k)
         wp.atomic_add(force, a, f)
@@ -92,7 +94,7 @@ def define(variant: Variant) -> wp.Kernel:
             xx = wp.outer(t, t) * (along - across) + wp.identity(n=3, dtype=scalar) * across
             wp.atomic_add(diagonal_xx, a, xx)
             wp.atomic_add(diagonal_xx, b, xx)
-            wp.atomic_add(upper_xx, stencil * a + direction, -xx)
+            wp.atomic_add(upper_xx, index(stencil * a + direction), -xx)
             if wp.static(sliding):
                 xs = t * (along * ratio)
                 ss = along * ratio * ratio
@@ -151,12 +153,13 @@ def define_contact_load(variant: Variant) -> wp.Kernel:
         contact_load: wp.array(dtype=scalar),
     ):
         """½ n·Fₛ of eq. 3, from the uncrimped positions: added for the warp, subtracted for the weft."""
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         rest = euler[2 * b + direction] - euler[2 * a + direction]
-        k = stretch_stiffness(stretch[segment_yarn[e]], radius[0])
+        k = stretch_stiffness(stretch[yarn], radius[0])
         half = scalar(0.5) - scalar(direction)
         f = stretch_force(position[b] - position[a], rest, k) * half
         wp.atomic_add(contact_load, a, wp.dot(normal[a], f))
