@@ -78,9 +78,10 @@ def functions(variant: Variant) -> SimpleNamespace:
         angle_over_sine: scalar,
     ) -> vec3:
         """Force on the end that t1 points to; k = 2k_b/Δs, mine and other (s, s', s'') of the two segments."""
-        turning = (t2 - t1 * wp.dot(t1, t2)) * (angle_over_sine * mine[0] * by_length)
-        along = t1 * (scalar(0.5) * (square - scalar(wp.static(FLAT))) * mine[1])
-        return (turning + along) * (-k * other[0])
+        force = (t2 - t1 * wp.dot(t1, t2)) * (-k * other[0] * angle_over_sine * mine[0] * by_length)
+        if mine[1] > scalar(0.0):
+            force -= t1 * (k * other[0] * scalar(0.5) * (square - scalar(wp.static(FLAT))) * mine[1])
+        return force
 
     @wp.func
     def bend_stiffness(modulus: scalar, radius: scalar) -> scalar:
@@ -182,8 +183,9 @@ def define(variant: Variant) -> wp.Kernel:
             kappa = scalar(0.5) * angle_over_sine * (scalar(1.0) + cosine)
             chi = in_plane_excess(wp.dot(w, w), cosine, square, kappa, angle_over_sine)
             eye = wp.identity(n=3, dtype=scalar)
-            turn = wp.skew(w)
-            rotation = kappa * (eye + turn + wp.outer(t1, t2)) + scalar(0.5) * angle_over_sine * (turn * turn)
+            # half the square of the skew matrix, written out
+            squared = (wp.outer(w, w) - eye * wp.dot(w, w)) * (scalar(0.5) * angle_over_sine)
+            rotation = kappa * (eye + wp.skew(w) + wp.outer(t1, t2)) + squared
             bb = (kappa * (eye - wp.outer(t1, t1)) + chi * wp.outer(q1, q1)) * (stiffness * by_l1 * by_l1)
             aa = (kappa * (eye - wp.outer(t2, t2)) + chi * wp.outer(q2, q2)) * (stiffness * by_l2 * by_l2)
             ba = (rotation + chi * wp.outer(q1, q2)) * (stiffness * by_l1 * by_l2)
