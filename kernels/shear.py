@@ -131,11 +131,12 @@ def define(variant: Variant) -> wp.Kernel:
         jams: int,
         threshold: scalar,
         ratio: scalar,
+        shut: scalar,
         matrix: int,
     ):
         """(force on p, force on r, ∇φ at p, ∇φ at r, factor of ∇φ ∇φᵀ, and of t tᵀ of p and of r).
 
-        s_p and s_r: (s, s', s'') of the two segments.
+        s_p and s_r: (s, s', s'') of the two segments; shut: the lock at φ = 0, where one of them fades.
         """
         angle = shear_angle(t_p, t_r)
         strain = angle[0]
@@ -161,7 +162,7 @@ def define(variant: Variant) -> wp.Kernel:
         if s_p[0] * s_r[0] < scalar(1.0):
             largest = scalar(wp.static(0.25 * wp.PI * wp.PI))
             if jams != 0:
-                largest *= shear_shut(threshold, ratio)
+                largest *= shut
             gain = scalar(0.5) * k * (energy - largest)
             f_p -= t_p * (gain * s_p[1] * s_r[0])
             f_r -= t_r * (gain * s_r[1] * s_p[0])
@@ -226,17 +227,20 @@ def define(variant: Variant) -> wp.Kernel:
         s_r = presence(l_r, unit)
         s_u = presence(l_u, unit)
         s_d = presence(l_d, unit)
+        shut = scalar(1.0)
+        if s_l[0] * s_r[0] * s_u[0] * s_d[0] < scalar(1.0):
+            shut = shear_shut(angle, ratio)
         f_lu, f_ul, g_lu, g_ul, k_lu, a_lu, a_ul = shear_corner(
-            t_l, t_u, b_l, b_u, s_l, s_u, k, jams[0], angle, ratio, matrix
+            t_l, t_u, b_l, b_u, s_l, s_u, k, jams[0], angle, ratio, shut, matrix
         )
         f_ld, f_dl, g_ld, g_dl, k_ld, a_ld, a_dl = shear_corner(
-            t_l, t_d, b_l, b_d, s_l, s_d, k, jams[1], angle, ratio, matrix
+            t_l, t_d, b_l, b_d, s_l, s_d, k, jams[1], angle, ratio, shut, matrix
         )
         f_ru, f_ur, g_ru, g_ur, k_ru, a_ru, a_ur = shear_corner(
-            t_r, t_u, b_r, b_u, s_r, s_u, k, jams[2], angle, ratio, matrix
+            t_r, t_u, b_r, b_u, s_r, s_u, k, jams[2], angle, ratio, shut, matrix
         )
         f_rd, f_dr, g_rd, g_dr, k_rd, a_rd, a_dr = shear_corner(
-            t_r, t_d, b_r, b_d, s_r, s_d, k, jams[3], angle, ratio, matrix
+            t_r, t_d, b_r, b_d, s_r, s_d, k, jams[3], angle, ratio, shut, matrix
         )
         f_l = f_lu + f_ld
         f_r = f_ru + f_rd
