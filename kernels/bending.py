@@ -98,6 +98,20 @@ def define(variant: Variant) -> wp.Kernel:
     presence, inverse_length = vanishing.functions(variant).presence, vanishing.functions(variant).inverse_length
 
     @wp.func
+    def bend_forces(e1: vec3, e2: vec3, k: scalar, unit: scalar):
+        """Forces on the ends that e1 and e2 lead to."""
+        l1 = wp.length(e1)
+        l2 = wp.length(e2)
+        s1 = presence(l1, unit)
+        s2 = presence(l2, unit)
+        t1 = wp.normalize(e1)
+        t2 = wp.normalize(e2)
+        angle = bend_angle(t1, t2)
+        f1 = bend_force(t1, t2, inverse_length(l1, unit), s1, s2, k, angle[0], angle[1])
+        f2 = bend_force(t2, t1, inverse_length(l2, unit), s2, s1, k, angle[0], angle[1])
+        return f1, f2
+
+    @wp.func
     def in_plane_excess(z: scalar, cosine: scalar, square: scalar, kappa: scalar, angle_over_sine: scalar) -> scalar:
         """(1 − κ)/sin²θ, → 1/12 at θ = 0."""
         if cosine > scalar(0.0) and z < scalar(wp.static(SERIES_BELOW)):
@@ -122,9 +136,12 @@ def define(variant: Variant) -> wp.Kernel:
         # state in
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vec3),
         # forces out
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
+        press: int,
+        contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
         weights: wp.array(dtype=vec3),
@@ -145,8 +162,19 @@ def define(variant: Variant) -> wp.Kernel:
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
+        k = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / rest
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
+        if press != 0:
+            # from the crimped positions, x − R n on a warp yarn and x + R n on a weft yarn
+            half = scalar(0.5) - scalar(direction)
+            crimp = scalar(-2.0) * half * radius[0]
+            pressing_b, pressing_a = bend_forces(
+                e1 + (normal[b] - normal[c]) * crimp, e2 + (normal[a] - normal[c]) * crimp, k * half, spacing[0]
+            )
+            wp.atomic_add(contact_load, a, wp.dot(normal[a], pressing_a))
+            wp.atomic_add(contact_load, b, wp.dot(normal[b], pressing_b))
+            wp.atomic_add(contact_load, c, -wp.dot(normal[c], pressing_a + pressing_b))
         l1 = wp.length(e1)
         l2 = wp.length(e2)
         s1 = presence(l1, spacing[0])
@@ -156,7 +184,6 @@ def define(variant: Variant) -> wp.Kernel:
         # by division: a straight yarn's are exact opposites
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
-        k = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / rest
         angle = bend_angle(t1, t2)
         square = angle[0]
         angle_over_sine = angle[1]
@@ -253,63 +280,4 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return bending_energy
 
 
-def define_contact_load(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
-    f = functions(variant)
-    bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
-    presence, inverse_length = vanishing.functions(variant).presence, vanishing.functions(variant).inverse_length
-
-    @variant.kernel("terms")
-    def bending_contact_load(
-        bend_nodes: wp.array(dtype=wp.vec3i),
-        bend_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
-        bend: wp.array(dtype=scalar),
-        radius: wp.array(dtype=scalar),
-        spacing: wp.array(dtype=scalar),
-        position: wp.array(dtype=vec3),
-        euler: wp.array(dtype=scalar),
-        normal: wp.array(dtype=vec3),
-        contact_load: wp.array(dtype=scalar),
-    ):
-        """½ n·F_b of eq. 3, from the crimped positions: x − R n on a warp yarn, x + R n on a weft yarn."""
-        e = index(wp.tid())
-        a = index(bend_nodes[e][0])
-        c = index(bend_nodes[e][1])
-        b = index(bend_nodes[e][2])
-        yarn = index(bend_yarn[e])
-        direction = index(yarn_direction[yarn])
-        rest = euler[2 * b + direction] - euler[2 * a + direction]
-        half = scalar(0.5) - scalar(direction)
-        crimp = scalar(-2.0) * half * radius[0]
-        center = position[c] + normal[c] * crimp
-        e1 = position[b] + normal[b] * crimp - center
-        e2 = position[a] + normal[a] * crimp - center
-        l1 = wp.length(e1)
-        l2 = wp.length(e2)
-        s1 = presence(l1, spacing[0])
-        s2 = presence(l2, spacing[0])
-        by_l1 = inverse_length(l1, spacing[0])
-        by_l2 = inverse_length(l2, spacing[0])
-        # by division: a straight yarn's are exact opposites
-        t1 = wp.normalize(e1)
-        t2 = wp.normalize(e2)
-        k = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / rest
-        angle = bend_angle(t1, t2)
-        f_b = bend_force(t1, t2, by_l1, s1, s2, k, angle[0], angle[1]) * half
-        f_a = bend_force(t2, t1, by_l2, s2, s1, k, angle[0], angle[1]) * half
-        wp.atomic_add(contact_load, a, wp.dot(normal[a], f_a))
-        wp.atomic_add(contact_load, b, wp.dot(normal[b], f_b))
-        wp.atomic_add(contact_load, c, -wp.dot(normal[c], f_a + f_b))
-
-    return bending_contact_load
-
-
-TERM = Term(
-    name="bending",
-    elements="bends",
-    define=define,
-    energy=define_energy,
-    stencil=4,
-    contact_load=define_contact_load,
-)
+TERM = Term(name="bending", elements="bends", define=define, energy=define_energy, stencil=4, presses=True)

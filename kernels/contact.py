@@ -10,7 +10,7 @@ out over the last of the sine of the angle between them, σ = |n·(a × b)|/(|a|
 b = x_down − x_up: its length is x³ (10 − 15 x + 6 x²) of x = σ/0.05, and 1 from there on.
 
 Two arrays carry it to shear and friction: ``normal``, and ``contact_load``, the sum inside the ReLU, to which each term
-that presses yarns together adds its part (``contact_load`` in its own file).
+that presses yarns together adds its part as it computes its force.
 """
 
 import functools
