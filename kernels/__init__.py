@@ -50,7 +50,7 @@ TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
 
 @functools.cache
 def build(variant: Variant) -> dict[str, wp.Kernel]:
-    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ``stretch_contact_load``, ...
+    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
@@ -59,8 +59,6 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
-        if term.contact_load is not None:
-            kernels[f"{term.name}_contact_load"] = term.contact_load(variant)
     for part in (step, ros2):
         kernels |= vars(part.define_reversible(variant))
     for part in (step, solver, incomplete, history, adjoint, stage, ros2):

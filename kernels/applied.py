@@ -5,6 +5,7 @@ Parameters: ``applied_force`` [N], of the chosen nodes in this step.
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -17,8 +18,8 @@ def define(variant: Variant) -> wp.Kernel:
         applied_force: wp.array(dtype=vec3),
         force: wp.array(dtype=vec3),
     ):
-        e = wp.tid()
-        wp.atomic_add(force, applied_node[e], applied_force[e])
+        e = index(wp.tid())
+        wp.atomic_add(force, index(applied_node[e]), applied_force[e])
 
     return applied_term
 

@@ -10,7 +10,7 @@ out over the last of the sine of the angle between them, σ = |n·(a × b)|/(|a|
 b = x_down − x_up: its length is x³ (10 − 15 x + 6 x²) of x = σ/0.05, and 1 from there on.
 
 Two arrays carry it to shear and friction: ``normal``, and ``contact_load``, the sum inside the ReLU, to which each term
-that presses yarns together adds its part (``contact_load`` in its own file).
+that presses yarns together adds its part as it computes its force.
 """
 
 import functools
@@ -18,10 +18,15 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Variant
 
 FADING = 0.05
 """Sine of the angle between warp and weft under which a crossing's normal fades: 3 degrees, far beyond any lock."""
+
+MOST_PASSES = 4
+TURNED = {wp.float64: 1e-12, wp.float32: 1e-5}
+"""Square of the sine by which a pass of the iteration may still turn a normal, its own error being the cube of that."""
 
 
 @functools.cache
@@ -52,16 +57,43 @@ def functions(variant: Variant) -> SimpleNamespace:
         return mean + scalar(2.0) * spread * wp.cos(angle)
 
     @wp.func
-    def plane_normal(covariance: mat33) -> vec3:
+    def near_normal(c: mat33, guess: vec3) -> vec3:
+        """Unit eigenvector of the smallest eigenvalue of a matrix of trace 1, from a guess of its direction; 0 where
+        that does not lead to it.
+
+        Rayleigh quotient iteration converges cubically, though to whichever eigenvector is near: it is the
+        smallest eigenvalue's where the gaps to both others are positive, and so their product and sum.
+        """
+        n = guess
+        square = wp.dot(n, n)
+        for _repeat in range(int(MOST_PASSES)):
+            shift = wp.dot(n, c * n) / square
+            m = adjugate(c - wp.identity(n=3, dtype=scalar) * shift)
+            last, last_square = n, square
+            n = m * last
+            square = wp.dot(n, n)
+            both, along = square * last_square, wp.dot(n, last)
+            if both - along * along < scalar(wp.static(TURNED[scalar])) * both:
+                if wp.trace(m) > scalar(0.0) and shift < scalar(wp.static(1.0 / 3.0)):
+                    return wp.normalize(n)
+                return vec3()
+        return vec3()
+
+    @wp.func
+    def plane_normal(covariance: mat33, guess: vec3) -> vec3:
         """Unit eigenvector of the smallest eigenvalue, of either sign; 0 where the points lie on no plane.
 
-        adj(C − λI) is n nᵀ times the other two gaps, so its largest column is the eigenvector; a second pass with
-        the Rayleigh quotient of the first takes away what the cosine and the cubic lost in digits.
+        Where the guess is too far from it: adj(C − λI) is n nᵀ times the other two gaps, so its largest column is the
+        eigenvector; a second pass with the Rayleigh quotient of the first takes away what the cosine and the cubic
+        lost in digits.
         """
         scale = wp.trace(covariance)
         if scale <= scalar(0.0):
             return vec3()
-        c = covariance / scale
+        c = covariance * (scalar(1.0) / scale)
+        near = near_normal(c, guess)
+        if wp.dot(near, near) > scalar(0.0):
+            return near
         shift = least_eigenvalue(c)
         n = vec3()
         for _repeat in range(2):
@@ -76,11 +108,11 @@ def functions(variant: Variant) -> SimpleNamespace:
         return n
 
     @wp.func_grad(plane_normal)
-    def adj_plane_normal(covariance: mat33, adj_ret: vec3):
+    def adj_plane_normal(covariance: mat33, guess: vec3, adj_ret: vec3):
         """dn = −(C − λI)⁺ dC n. Through the eigenvalues themselves it would be singular at rest, where the other two
         are equal; only their distance to the smallest one matters."""
         scale = wp.trace(covariance)
-        n = plane_normal(covariance)
+        n = plane_normal(covariance, guess)
         if wp.dot(n, n) > scalar(0.0):
             c = covariance / scale
             shifted = c - wp.identity(n=3, dtype=scalar) * wp.dot(n, c * n) + wp.outer(n, n)
@@ -104,31 +136,30 @@ def define_normal(variant: Variant) -> wp.Kernel:
         position: wp.array(dtype=vec3),
         normal: wp.array(dtype=vec3),
     ):
-        i = crossing_node[wp.tid()]
-        neighbours = crossing_neighbours[wp.tid()]
+        e = index(wp.tid())
+        i = index(crossing_node[e])
+        neighbours = crossing_neighbours[e]
         # Differences to the crossing, not positions: far from the origin their products would lose every digit.
-        left = position[neighbours[0]] - position[i]
-        right = position[neighbours[1]] - position[i]
-        up = position[neighbours[2]] - position[i]
-        down = position[neighbours[3]] - position[i]
+        left = position[index(neighbours[0])] - position[i]
+        right = position[index(neighbours[1])] - position[i]
+        up = position[index(neighbours[2])] - position[i]
+        down = position[index(neighbours[3])] - position[i]
         total = left + right + up + down
         covariance = wp.outer(left, left) + wp.outer(right, right) + wp.outer(up, up) + wp.outer(down, down)
         covariance -= wp.outer(total, total) * scalar(0.2)
-        n = plane_normal(covariance)
         across = right - left
         along = down - up
-        side = wp.dot(n, wp.cross(across, along))
-        size = wp.length(across) * wp.length(along)
-        sine = scalar(0.0)
-        if size > scalar(0.0):
-            sine = wp.abs(side) / size
-        if flipped[i] != 0:
-            side = -side
-        if side < scalar(0.0):
-            n = -n
-        x = sine / scalar(wp.static(FADING))
-        if x < scalar(1.0):
+        outward = wp.cross(across, along)
+        n = plane_normal(covariance, outward)
+        side = wp.dot(n, outward)
+        full = scalar(FADING) * wp.length(across) * wp.length(along)
+        if wp.abs(side) <= full:
+            x = scalar(0.0)
+            if full > scalar(0.0):
+                x = wp.abs(side) / full
             n *= x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x))
+        if (side < scalar(0.0)) != (flipped[i] != 0):
+            n = -n
         normal[i] = n
 
     return contact_normal

@@ -10,6 +10,7 @@ nothing of it.
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -28,13 +29,14 @@ def define(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
-        half_density = scalar(0.5) * density[segment_yarn[e]]
+        half_density = scalar(0.5) * density[yarn]
         f = gravity[0] * (half_density * (euler[sb] - euler[sa]))
         wp.atomic_add(force, a, f)
         wp.atomic_add(force, b, f)

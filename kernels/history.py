@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Variant
 
 
@@ -31,14 +32,14 @@ def define(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def take(counters: wp.array(dtype=int), path: wp.array(dtype=vec3), values: wp.array(dtype=vec3)):
         """This step's row of a path; its last row ever after."""
-        e = wp.tid()
+        e = index(wp.tid())
         rows = path.shape[0] / values.shape[0]
         values[e] = path[wp.min(counters[1], rows - 1) * values.shape[0] + e]
 
     @wp.kernel(module=module, enable_backward=False)
     def give(counters: wp.array(dtype=int), values_grad: wp.array(dtype=vec3), path_grad: wp.array(dtype=vec3)):
         """Adjoint of ``take``."""
-        e = wp.tid()
+        e = index(wp.tid())
         rows = path_grad.shape[0] / values_grad.shape[0]
         k = wp.min(counters[1], rows - 1) * values_grad.shape[0] + e
         path_grad[k] = path_grad[k] + values_grad[e]
@@ -59,8 +60,8 @@ def define(variant: Variant) -> SimpleNamespace:
         frame_euler_velocity: wp.array(dtype=scalar),
         frame_anchor: wp.array(dtype=scalar),
     ):
-        i = wp.tid()
-        k = counters[0] * nodes + i
+        i = index(wp.tid())
+        k = index(counters[0] * nodes + i)
         frame_position[k] = position[i]
         frame_velocity[k] = velocity[i]
         if wp.static(sliding):
@@ -89,8 +90,8 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_next: wp.array(dtype=scalar),
     ):
         """The state that a step started from, and what the step made of it."""
-        i = wp.tid()
-        k = counters[0] * nodes + i
+        i = index(wp.tid())
+        k = index(counters[0] * nodes + i)
         next = k + nodes
         position[i] = frame_position[k]
         velocity[i] = frame_velocity[k]
@@ -119,8 +120,8 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity_grad: wp.array(dtype=scalar),
     ):
         """Adds what the loss asks of the present frame to the running adjoints."""
-        i = wp.tid()
-        k = counters[0] * nodes + i
+        i = index(wp.tid())
+        k = index(counters[0] * nodes + i)
         position_grad[i] = position_grad[i] + frame_position_grad[k]
         velocity_grad[i] = velocity_grad[i] + frame_velocity_grad[k]
         for d in range(2):

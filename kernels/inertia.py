@@ -13,6 +13,7 @@ two vanish where yarns do not slide. Their derivatives are not symmetric, and ar
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -47,14 +48,15 @@ def define_mass(variant: Variant) -> wp.Kernel:
         upper_sx: wp.array(dtype=vec3),
         upper_ss: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
-        m = density[segment_yarn[e]] * rest * scalar(wp.static(1.0 / 6.0)) * weights[0][0]
+        m = density[yarn] * rest * scalar(wp.static(1.0 / 6.0)) * weights[0][0]
         two = scalar(2.0)
         va = velocity[a]
         vb = velocity[b]
@@ -76,7 +78,7 @@ def define_mass(variant: Variant) -> wp.Kernel:
             xx = wp.identity(n=3, dtype=scalar) * m
             wp.atomic_add(diagonal_xx, a, two * xx)
             wp.atomic_add(diagonal_xx, b, two * xx)
-            wp.atomic_add(upper_xx, stencil * a + direction, xx)
+            wp.atomic_add(upper_xx, index(stencil * a + direction), xx)
             if wp.static(sliding):
                 w = (position[b] - position[a]) / rest
                 xs = w * (-m)
@@ -109,17 +111,18 @@ def define_inertia(variant: Variant) -> wp.Kernel:
         euler_force: wp.array(dtype=scalar),
     ):
         """∂T/∂q."""
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest
         va = velocity[a] - w * euler_velocity[sa]
         vb = velocity[b] - w * euler_velocity[sb]
-        m = density[segment_yarn[e]] * rest * scalar(wp.static(1.0 / 6.0))
+        m = density[yarn] * rest * scalar(wp.static(1.0 / 6.0))
         two = scalar(2.0)
         by_w = ((two * va + vb) * euler_velocity[sa] + (va + two * vb) * euler_velocity[sb]) * (-m)
         by_x = by_w / rest
@@ -149,10 +152,11 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
         euler_force: wp.array(dtype=scalar),
     ):
         """−Ṁ q̇: minus the rate of the momentum M q̇ when q moves and q̇ is held."""
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
@@ -164,8 +168,8 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
         va_rate = w_rate * (-euler_velocity[sa])
         vb_rate = w_rate * (-euler_velocity[sb])
         two = scalar(2.0)
-        m_rate = density[segment_yarn[e]] * rest_rate * scalar(wp.static(1.0 / 6.0))
-        m = density[segment_yarn[e]] * rest * scalar(wp.static(1.0 / 6.0))
+        m_rate = density[yarn] * rest_rate * scalar(wp.static(1.0 / 6.0))
+        m = density[yarn] * rest * scalar(wp.static(1.0 / 6.0))
         pa = m * (two * va + vb)
         pb = m * (va + two * vb)
         pa_rate = m_rate * (two * va + vb) + m * (two * va_rate + vb_rate)

@@ -22,6 +22,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import stretch as stretching
+from .indexing import index
 from .variant import Term, Variant
 
 BARRIER = 0.2
@@ -79,10 +80,11 @@ def define(variant: Variant) -> wp.Kernel:
         diagonal_ss: wp.array(dtype=scalar),
         upper_ss: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         distance = scalar(2.0) * radius[0]
@@ -93,7 +95,7 @@ def define(variant: Variant) -> wp.Kernel:
         if overlap > scalar(0.0):
             k = parallel_stiffness[0] * spacing[0]
             reach = radius[0] * scalar(wp.static(BARRIER))
-            guard = barrier(rest, reach, k + stretch_stiffness(stretch[segment_yarn[e]], radius[0]))
+            guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], radius[0]))
             f = k * overlap + guard[1]
             wp.atomic_add(euler_force, sa, -f)
             wp.atomic_add(euler_force, sb, f)

@@ -8,6 +8,7 @@ nodes out of the system (``kernels/step.py``).
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -25,8 +26,8 @@ def define(variant: Variant) -> wp.Kernel:
         weights: wp.array(dtype=vec3),
         diagonal_xx: wp.array(dtype=mat33),
     ):
-        e = wp.tid()
-        i = pin_node[e]
+        e = index(wp.tid())
+        i = index(pin_node[e])
         wp.atomic_add(force, i, (pin_target[e] - position[i]) * pin_stiffness[0])
         if matrix != 0:
             wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (weights[0][2] * pin_stiffness[0]))

@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import vanishing
+from .indexing import index
 from .variant import Term, Variant
 
 OF_CURVATURE = 0.8
@@ -30,6 +31,9 @@ OF_CURVATURE = 0.8
 within 25 degrees of the right angle."""
 FLAT = {wp.float64: 1e-12, wp.float32: 1e-5}
 """Sine of an angle that cannot be told from a fold's: what t₁ cos φ − t₂ is there, is rounding."""
+WIDE = 0.9
+"""Cosine from which on an angle is taken from the sum and the difference of the directions, since an asin would lose
+digits: these cost two square roots and an atan2, half as much again."""
 LOCK_EXPONENT = 3
 LOCK_SMOOTHNESS = 0.6
 
@@ -40,64 +44,141 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def shear_lock(
-        phi: scalar, sine: scalar, cosine: scalar, threshold: scalar, spacing_by_radius: scalar, second: int
+        strain: scalar, sine: scalar, cosine: scalar, threshold: scalar, spacing_by_radius: scalar, second: int
     ) -> vec3:
-        """(lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of φ/2."""
+        """(lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of φ/2.
+
+        ½ (1 − tanh z) = 1/(1 + exp 2z) =: part, of what is locked; z is from −5 to 14 whatever the angle.
+        """
         zero = scalar(0.0)
         one = scalar(1.0)
         two = scalar(2.0)
-        half = scalar(0.5)
         exponent = scalar(LOCK_EXPONENT)
-        right = scalar(wp.static(0.5 * wp.PI))
         right4 = scalar(wp.static((0.5 * wp.PI) ** 4))
         right5 = scalar(wp.static((0.5 * wp.PI) ** 5))
+        phi = strain + scalar(wp.static(0.5 * wp.PI))
         gamma = wp.max((scalar(wp.static(2.0**0.5)) - two * sine) * spacing_by_radius, zero)
         gamma_rate = -cosine * spacing_by_radius
-        boost = gamma * gamma * gamma
-        boost_rate = exponent * gamma * gamma * gamma_rate
+        excess = gamma * gamma * gamma - one
+        excess_rate = exponent * gamma * gamma * gamma_rate
         a = phi - threshold
-        b = phi - right
-        product = phi * a * b
-        product_rate = a * b + phi * b + phi * a
+        product = phi * a * strain
+        product_rate = a * strain + phi * strain + phi * a
         by_below = one / (product * product + right4 * scalar(wp.static(LOCK_SMOOTHNESS**2)))
         below_rate = two * product * product_rate
-        s = wp.tanh(right5 * a * by_below)
+        part = one / (one + wp.exp(two * right5 * a * by_below))
         z_rate = right5 * by_below * (one - a * below_rate * by_below)
-        s_rate = (one - s * s) * z_rate
-        lock = half * ((one + boost) + (one - boost) * s)
-        rate = half * (boost_rate * (one - s) + (one - boost) * s_rate)
+        slope = part * (one - part)
+        part_rate = -two * slope * z_rate
+        lock = one + excess * part
+        rate = excess_rate * part + excess * part_rate
         rate2 = zero
         if second != 0:
-            gamma_rate2 = half * sine * spacing_by_radius
-            boost_rate2 = exponent * gamma * (two * gamma_rate * gamma_rate + gamma * gamma_rate2)
-            below_rate2 = two * (product_rate * product_rate + product * two * (phi + a + b))
+            gamma_rate2 = scalar(0.5) * sine * spacing_by_radius
+            excess_rate2 = exponent * gamma * (two * gamma_rate * gamma_rate + gamma * gamma_rate2)
+            below_rate2 = two * (product_rate * product_rate + product * two * (phi + a + strain))
             z_rate2 = -two * below_rate - a * below_rate2 + two * a * below_rate * below_rate * by_below
             z_rate2 *= right5 * by_below * by_below
-            s_rate2 = (one - s * s) * (z_rate2 - two * s * z_rate * z_rate)
-            rate2 = half * (boost_rate2 * (one - s) - two * boost_rate * s_rate + (one - boost) * s_rate2)
+            part_rate2 = -two * slope * (z_rate2 - two * (one - two * part) * z_rate * z_rate)
+            rate2 = excess_rate2 * part + two * excess_rate * part_rate + excess * part_rate2
         return vec3(lock, rate, rate2)
 
     @wp.func
     def shear_angle(t1: vec3, t2: vec3) -> vec3:
-        """(φ, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle (Kahan)."""
-        sine = scalar(0.5) * wp.length(t1 - t2)
-        cosine = scalar(0.5) * wp.length(t1 + t2)
-        return vec3(scalar(2.0) * wp.atan2(sine, cosine), sine, cosine)
+        """(φ − π/2, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle."""
+        half = scalar(0.5)
+        across = wp.dot(t1, t2)
+        if wp.abs(across) < scalar(WIDE):
+            return vec3(
+                -wp.asin(across),
+                wp.sqrt(half * (scalar(1.0) - across)),
+                wp.sqrt(half * (scalar(1.0) + across)),
+            )
+        sine = half * wp.length(t1 - t2)
+        cosine = half * wp.length(t1 + t2)
+        return vec3(scalar(2.0) * wp.atan2(sine, cosine) - scalar(wp.static(0.5 * wp.PI)), sine, cosine)
 
-    return SimpleNamespace(lock=shear_lock, angle=shear_angle)
+    @wp.func
+    def shear_shut(threshold: scalar, spacing_by_radius: scalar) -> scalar:
+        """The lock at φ = 0."""
+        strain = scalar(wp.static(-0.5 * wp.PI))
+        return shear_lock(strain, scalar(0.0), scalar(1.0), threshold, spacing_by_radius, 0)[0]
+
+    @wp.func
+    def shear_unlocked(shear: scalar, radius: scalar, spacing: scalar, load: scalar) -> scalar:
+        """k L of a corner that does not jam [N m]."""
+        pressed = scalar(1.0) + wp.max(load, scalar(0.0))
+        return shear * scalar(wp.static(wp.PI)) * radius * radius * pressed * spacing
+
+    return SimpleNamespace(lock=shear_lock, angle=shear_angle, shut=shear_shut, unlocked=shear_unlocked)
 
 
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
-    shear_lock, shear_angle = functions(variant).lock, functions(variant).angle
+    f = functions(variant)
+    shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
     presence, inverse_length = vanishing.functions(variant).presence, vanishing.functions(variant).inverse_length
+
+    @wp.func
+    def shear_corner(
+        t_p: vec3,
+        t_r: vec3,
+        by_p: scalar,
+        by_r: scalar,
+        s_p: vec3,
+        s_r: vec3,
+        k: scalar,
+        jams: int,
+        threshold: scalar,
+        ratio: scalar,
+        shut: scalar,
+        matrix: int,
+    ):
+        """(force on p, force on r, ∇φ at p, ∇φ at r, factor of ∇φ ∇φᵀ, and of t tᵀ of p and of r).
+
+        s_p and s_r: (s, s', s'') of the two segments; shut: the lock at φ = 0, where one of them fades.
+        """
+        angle = shear_angle(t_p, t_r)
+        strain = angle[0]
+        held = scalar(1.0)
+        energy = strain * strain
+        curvature = scalar(1.0)
+        if jams != 0:
+            lock = shear_lock(strain, angle[1], angle[2], threshold, ratio, matrix)
+            held = lock[0] + scalar(0.5) * lock[1] * strain
+            energy *= lock[0]
+            curvature = lock[0] + scalar(2.0) * strain * lock[1] + scalar(0.5) * strain * strain * lock[2]
+        # ∇φ; where the corner is folded flat its direction is undefined, and becomes 0
+        across = wp.dot(t_p, t_r)
+        by_sine = scalar(1.0) / wp.max(scalar(2.0) * angle[1] * angle[2], scalar(wp.static(FLAT[scalar])))
+        g_p = (t_p * across - t_r) * (by_sine * by_p)
+        g_r = (t_r * across - t_p) * (by_sine * by_r)
+        here = k * s_p[0] * s_r[0]
+        moment = here * held * strain
+        f_p = g_p * (-moment)
+        f_r = g_r * (-moment)
+        along_p = scalar(0.0)
+        along_r = scalar(0.0)
+        if s_p[0] * s_r[0] < scalar(1.0):
+            largest = scalar(wp.static(0.25 * wp.PI * wp.PI))
+            if jams != 0:
+                largest *= shut
+            gain = scalar(0.5) * k * (energy - largest)
+            f_p -= t_p * (gain * s_p[1] * s_r[0])
+            f_r -= t_r * (gain * s_r[1] * s_p[0])
+            along_p = wp.max(gain * s_p[2] * s_r[0], scalar(0.0))
+            along_r = wp.max(gain * s_r[2] * s_p[0], scalar(0.0))
+        stiffness = here * wp.max(held, scalar(wp.static(OF_CURVATURE)) * curvature)
+        return f_p, f_r, g_p, g_r, stiffness, along_p, along_r
 
     @variant.kernel("terms")
     def shear_term(
         # topology
-        corner_nodes: wp.array(dtype=wp.vec3i),
-        corner_jams: wp.array(dtype=int),
-        corner_blocks: wp.array(dtype=wp.vec3i),
+        crossing_node: wp.array(dtype=int),
+        crossing_neighbours: wp.array(dtype=wp.vec4i),
+        corner_jams: wp.array(dtype=wp.vec4i),
+        corner_blocks: wp.array(dtype=wp.vec4i),
+        stencil: int,
         # parameters
         shear: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
@@ -114,97 +195,108 @@ def define(variant: Variant) -> wp.Kernel:
         diagonal_xx: wp.array(dtype=mat33),
         upper_xx: wp.array(dtype=mat33),
     ):
-        e = wp.tid()
-        p = corner_nodes[e][0]
-        c = corner_nodes[e][1]
-        r = corner_nodes[e][2]
-        e1 = position[p] - position[c]
-        e2 = position[r] - position[c]
-        l1 = wp.length(e1)
-        l2 = wp.length(e2)
-        by_l1 = inverse_length(l1, spacing[0])
-        by_l2 = inverse_length(l2, spacing[0])
-        t1 = e1 * by_l1
-        t2 = e2 * by_l2
-        angle = shear_angle(t1, t2)
-        phi = angle[0]
-        ratio = spacing[0] / radius[0]
-        strain = phi - scalar(wp.static(0.5 * wp.PI))
-        pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
-        k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
-        s_p = presence(l1, spacing[0])
-        s_r = presence(l2, spacing[0])
-        gain = scalar(0.0)
-        if s_p[0] * s_r[0] < scalar(1.0):
-            now = strain * strain
-            shut = scalar(wp.static(0.25 * wp.PI * wp.PI))
-            if corner_jams[e] != 0:
-                now *= shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, 0)[0]
-                shut *= shear_lock(scalar(0.0), scalar(0.0), scalar(1.0), lock_angle[0], ratio, 0)[0]
-            gain = scalar(0.5) * k * (now - shut)
-        curvature = k
-        if corner_jams[e] != 0:
-            lock = shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, matrix)
-            curvature *= lock[0] + scalar(2.0) * strain * lock[1] + scalar(0.5) * strain * strain * lock[2]
-            k *= lock[0] + scalar(0.5) * lock[1] * strain
-        # ∇φ; where the corner is folded flat its direction is undefined, and becomes 0
-        across = wp.dot(t1, t2)
-        by_sine = scalar(1.0) / wp.max(scalar(2.0) * angle[1] * angle[2], scalar(wp.static(FLAT[scalar])))
-        g_p = (t1 * across - t2) * (by_sine * by_l1)
-        g_r = (t2 * across - t1) * (by_sine * by_l2)
-        g_c = -(g_p + g_r)
-        k *= s_p[0] * s_r[0]
-        curvature *= s_p[0] * s_r[0]
-        moment = k * strain
-        f_p = g_p * moment + t1 * (gain * s_p[1] * s_r[0])
-        f_r = g_r * moment + t2 * (gain * s_r[1] * s_p[0])
-        wp.atomic_add(force, p, -f_p)
-        wp.atomic_add(force, r, -f_r)
-        wp.atomic_add(force, c, f_p + f_r)
+        e = index(wp.tid())
+        c = index(crossing_node[e])
+        left = index(crossing_neighbours[e][0])
+        right = index(crossing_neighbours[e][1])
+        up = index(crossing_neighbours[e][2])
+        down = index(crossing_neighbours[e][3])
+        jams = corner_jams[e]
+        unit = spacing[0]
+        ratio = unit / radius[0]
+        angle = lock_angle[0]
+        k = shear_unlocked(shear[0], radius[0], unit, contact_load[c])
+        x = position[c]
+        e_l = position[left] - x
+        e_r = position[right] - x
+        e_u = position[up] - x
+        e_d = position[down] - x
+        l_l = wp.length(e_l)
+        l_r = wp.length(e_r)
+        l_u = wp.length(e_u)
+        l_d = wp.length(e_d)
+        b_l = inverse_length(l_l, unit)
+        b_r = inverse_length(l_r, unit)
+        b_u = inverse_length(l_u, unit)
+        b_d = inverse_length(l_d, unit)
+        t_l = e_l * b_l
+        t_r = e_r * b_r
+        t_u = e_u * b_u
+        t_d = e_d * b_d
+        s_l = presence(l_l, unit)
+        s_r = presence(l_r, unit)
+        s_u = presence(l_u, unit)
+        s_d = presence(l_d, unit)
+        shut = scalar(1.0)
+        if s_l[0] * s_r[0] * s_u[0] * s_d[0] < scalar(1.0):
+            shut = shear_shut(angle, ratio)
+        f_lu, f_ul, g_lu, g_ul, k_lu, a_lu, a_ul = shear_corner(
+            t_l, t_u, b_l, b_u, s_l, s_u, k, jams[0], angle, ratio, shut, matrix
+        )
+        f_ld, f_dl, g_ld, g_dl, k_ld, a_ld, a_dl = shear_corner(
+            t_l, t_d, b_l, b_d, s_l, s_d, k, jams[1], angle, ratio, shut, matrix
+        )
+        f_ru, f_ur, g_ru, g_ur, k_ru, a_ru, a_ur = shear_corner(
+            t_r, t_u, b_r, b_u, s_r, s_u, k, jams[2], angle, ratio, shut, matrix
+        )
+        f_rd, f_dr, g_rd, g_dr, k_rd, a_rd, a_dr = shear_corner(
+            t_r, t_d, b_r, b_d, s_r, s_d, k, jams[3], angle, ratio, shut, matrix
+        )
+        f_l = f_lu + f_ld
+        f_r = f_ru + f_rd
+        f_u = f_ul + f_ur
+        f_d = f_dl + f_dr
+        wp.atomic_add(force, left, f_l)
+        wp.atomic_add(force, right, f_r)
+        wp.atomic_add(force, up, f_u)
+        wp.atomic_add(force, down, f_d)
+        wp.atomic_add(force, c, -(f_l + f_r + f_u + f_d))
 
         if matrix != 0:
-            stiffness = weights[0][2] * wp.max(k, scalar(wp.static(OF_CURVATURE)) * curvature)
-            wp.atomic_add(diagonal_xx, p, wp.outer(g_p, g_p) * stiffness)
-            wp.atomic_add(diagonal_xx, r, wp.outer(g_r, g_r) * stiffness)
-            wp.atomic_add(diagonal_xx, c, wp.outer(g_c, g_c) * stiffness)
-            # a block stands in the row of its lower node
+            # between two neighbours of the crossing, and of each with itself
+            h = weights[0][2]
+            ul = wp.outer(g_ul, g_lu) * (h * k_lu)
+            dl = wp.outer(g_dl, g_ld) * (h * k_ld)
+            ur = wp.outer(g_ur, g_ru) * (h * k_ru)
+            dr = wp.outer(g_dr, g_rd) * (h * k_rd)
+            ll = (wp.outer(g_lu, g_lu) * k_lu + wp.outer(g_ld, g_ld) * k_ld + wp.outer(t_l, t_l) * (a_lu + a_ld)) * h
+            rr = (wp.outer(g_ru, g_ru) * k_ru + wp.outer(g_rd, g_rd) * k_rd + wp.outer(t_r, t_r) * (a_ru + a_rd)) * h
+            uu = (wp.outer(g_ul, g_ul) * k_lu + wp.outer(g_ur, g_ur) * k_ru + wp.outer(t_u, t_u) * (a_ul + a_ur)) * h
+            dd = (wp.outer(g_dl, g_dl) * k_ld + wp.outer(g_dr, g_dr) * k_rd + wp.outer(t_d, t_d) * (a_dl + a_dr)) * h
+            # the rows of a crossing and its neighbours add up to 0, for nothing depends on where they are together
+            lc = -(ll + wp.transpose(ul + dl))
+            rc = -(rr + wp.transpose(ur + dr))
+            uc = -(uu + ul + ur)
+            dc = -(dd + dl + dr)
+            wp.atomic_add(diagonal_xx, left, ll)
+            wp.atomic_add(diagonal_xx, right, rr)
+            wp.atomic_add(diagonal_xx, up, uu)
+            wp.atomic_add(diagonal_xx, down, dd)
+            wp.atomic_add(diagonal_xx, c, -(lc + rc + uc + dc))
+            wp.atomic_add(upper_xx, index(stencil * left), lc)
+            wp.atomic_add(upper_xx, index(stencil * c), wp.transpose(rc))
+            wp.atomic_add(upper_xx, index(stencil * up + 1), uc)
+            wp.atomic_add(upper_xx, index(stencil * c + 1), wp.transpose(dc))
             blocks = corner_blocks[e]
-            g_c *= stiffness
-            if p < c:
-                wp.atomic_add(upper_xx, blocks[0], wp.outer(g_p, g_c))
-            else:
-                wp.atomic_add(upper_xx, blocks[0], wp.outer(g_c, g_p))
-            if r < c:
-                wp.atomic_add(upper_xx, blocks[1], wp.outer(g_r, g_c))
-            else:
-                wp.atomic_add(upper_xx, blocks[1], wp.outer(g_c, g_r))
-            if p < r:
-                wp.atomic_add(upper_xx, blocks[2], wp.outer(g_p, g_r) * stiffness)
-            else:
-                wp.atomic_add(upper_xx, blocks[2], wp.outer(g_r, g_p) * stiffness)
-            if s_p[2] < scalar(0.0):
-                along = wp.outer(t1, t1) * (weights[0][2] * gain * s_p[2] * s_r[0])
-                wp.atomic_add(diagonal_xx, p, along)
-                wp.atomic_add(diagonal_xx, c, along)
-                wp.atomic_add(upper_xx, blocks[0], -along)
-            if s_r[2] < scalar(0.0):
-                along = wp.outer(t2, t2) * (weights[0][2] * gain * s_r[2] * s_p[0])
-                wp.atomic_add(diagonal_xx, r, along)
-                wp.atomic_add(diagonal_xx, c, along)
-                wp.atomic_add(upper_xx, blocks[1], -along)
+            wp.atomic_add(upper_xx, index(blocks[0]), ul)
+            wp.atomic_add(upper_xx, index(blocks[1]), wp.transpose(dl))
+            wp.atomic_add(upper_xx, index(blocks[2]), ur)
+            wp.atomic_add(upper_xx, index(blocks[3]), wp.transpose(dr))
 
     return shear_term
 
 
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
-    shear_lock, shear_angle = functions(variant).lock, functions(variant).angle
+    f = functions(variant)
+    shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
     presence = vanishing.functions(variant).presence
 
     @variant.kernel("energy")
     def shear_energy(
-        corner_nodes: wp.array(dtype=wp.vec3i),
-        corner_jams: wp.array(dtype=int),
+        crossing_node: wp.array(dtype=int),
+        crossing_neighbours: wp.array(dtype=wp.vec4i),
+        corner_jams: wp.array(dtype=wp.vec4i),
         shear: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
@@ -214,24 +306,22 @@ def define_energy(variant: Variant) -> wp.Kernel:
         energy: wp.array(dtype=scalar),
     ):
         e = wp.tid()
-        c = corner_nodes[e][1]
-        e1 = position[corner_nodes[e][0]] - position[c]
-        e2 = position[corner_nodes[e][2]] - position[c]
-        fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
-        angle = shear_angle(wp.normalize(e1), wp.normalize(e2))
-        phi = angle[0]
+        c = crossing_node[e]
+        k = shear_unlocked(shear[0], radius[0], spacing[0], contact_load[c])
         ratio = spacing[0] / radius[0]
-        strain = phi - scalar(wp.static(0.5 * wp.PI))
-        pressed = scalar(1.0) + wp.max(contact_load[c], scalar(0.0))
-        k = shear[0] * scalar(wp.static(wp.PI)) * radius[0] * radius[0] * pressed * spacing[0]
-        largest = k * scalar(wp.static(0.25 * wp.PI * wp.PI))
-        if corner_jams[e] != 0:
-            k *= shear_lock(phi, angle[1], angle[2], lock_angle[0], ratio, 0)[0]
-            largest *= shear_lock(scalar(0.0), scalar(0.0), scalar(1.0), lock_angle[0], ratio, 0)[0]
-        faded = k * strain * strain * fading + largest * (scalar(1.0) - fading)
-        wp.atomic_add(energy, 0, scalar(0.5) * faded)
+        for corner in range(4):
+            e1 = position[crossing_neighbours[e][corner / 2]] - position[c]
+            e2 = position[crossing_neighbours[e][2 + corner % 2]] - position[c]
+            fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
+            angle = shear_angle(wp.normalize(e1), wp.normalize(e2))
+            now = angle[0] * angle[0]
+            largest = scalar(wp.static(0.25 * wp.PI * wp.PI))
+            if corner_jams[e][corner] != 0:
+                now *= shear_lock(angle[0], angle[1], angle[2], lock_angle[0], ratio, 0)[0]
+                largest *= shear_shut(lock_angle[0], ratio)
+            wp.atomic_add(energy, 0, scalar(0.5) * k * (now * fading + largest * (scalar(1.0) - fading)))
 
     return shear_energy
 
 
-TERM = Term(name="shear", elements="corners", define=define, energy=define_energy, stencil=6, needs_contact=True)
+TERM = Term(name="shear", elements="crossings", define=define, energy=define_energy, stencil=6, needs_contact=True)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Variant
 
 NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED = 1, 2, 3, 4
@@ -32,7 +33,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         rhs: wp.array(dtype=vec3),
         euler_rhs: wp.array(dtype=scalar),
     ):
-        i = wp.tid()
+        i = index(wp.tid())
         rhs[i] = force[i] * step_size[0] + momentum[i]
         if wp.static(sliding):
             for direction in range(2):
@@ -51,8 +52,8 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         solution: wp.array(dtype=vec3),
     ):
         """The velocity that brings an exact pin to its target within the step, or what is left of it."""
-        e = wp.tid()
-        i = pin_node[e]
+        e = index(wp.tid())
+        i = index(pin_node[e])
         solution[i] = (pin_target[e] - position[i]) / remaining[0]
 
     return SimpleNamespace(right_hand_side=right_hand_side, prescribe=prescribe)
@@ -73,7 +74,7 @@ def define(variant: Variant) -> SimpleNamespace:
         inverse_s: wp.array(dtype=scalar),
     ):
         """Jacobi: the inverse of the diagonal, and 0 for what does not move, which keeps it out of the iteration."""
-        i = wp.tid()
+        i = index(wp.tid())
         one = scalar(1.0)
         if is_free[i] != 0:
             block = diagonal_xx[i]
@@ -100,7 +101,7 @@ def define(variant: Variant) -> SimpleNamespace:
         status: wp.array(dtype=int),
     ):
         """q⁺ = q + h q̇⁺, and whether it is finite."""
-        i = wp.tid()
+        i = index(wp.tid())
         h = step_size[0]
         v = solution[i]
         x = position[i] + v * h
@@ -128,34 +129,35 @@ def define(variant: Variant) -> SimpleNamespace:
         status: wp.array(dtype=int),
     ):
         """Δs > 0: crossings keep their order along a yarn."""
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         if euler[2 * segment_nodes[e][1] + direction] <= euler[2 * a + direction]:
             if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
                 status[1] = a
 
     @wp.kernel(module=module, enable_backward=False)
     def copy_vectors(source: wp.array(dtype=vec3), target: wp.array(dtype=vec3)):
-        i = wp.tid()
+        i = index(wp.tid())
         target[i] = source[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def copy_numbers(source: wp.array(dtype=scalar), target: wp.array(dtype=scalar)):
-        i = wp.tid()
+        i = index(wp.tid())
         target[i] = source[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def clear_vectors(array: wp.array(dtype=vec3)):
-        array[wp.tid()] = vec3()
+        array[index(wp.tid())] = vec3()
 
     @wp.kernel(module=module, enable_backward=False)
     def clear_matrices(array: wp.array(dtype=mat33)):
-        array[wp.tid()] = mat33()
+        array[index(wp.tid())] = mat33()
 
     @wp.kernel(module=module, enable_backward=False)
     def clear_numbers(array: wp.array(dtype=scalar)):
-        array[wp.tid()] = scalar(0.0)
+        array[index(wp.tid())] = scalar(0.0)
 
     return SimpleNamespace(
         clear_vectors=clear_vectors,

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -52,9 +53,12 @@ def define(variant: Variant) -> wp.Kernel:
         # state in
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vec3),
         # forces out
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
+        press: int,
+        contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
         weights: wp.array(dtype=vec3),
@@ -66,19 +70,25 @@ def define(variant: Variant) -> wp.Kernel:
         upper_sx: wp.array(dtype=vec3),
         upper_ss: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
         d = position[b] - position[a]
-        k = stretch_stiffness(stretch[segment_yarn[e]], radius[0])
+        k = stretch_stiffness(stretch[yarn], radius[0])
 
         f = stretch_force(d, rest, k)
         wp.atomic_add(force, a, f)
         wp.atomic_add(force, b, -f)
+        if press != 0:
+            # added for the warp, subtracted for the weft
+            half = scalar(0.5) - scalar(direction)
+            wp.atomic_add(contact_load, a, half * wp.dot(normal[a], f))
+            wp.atomic_add(contact_load, b, -half * wp.dot(normal[b], f))
         ratio = wp.length(d) / rest
         if wp.static(sliding):
             f_s = scalar(0.5) * k * (ratio * ratio - scalar(1.0))
@@ -92,7 +102,7 @@ def define(variant: Variant) -> wp.Kernel:
             xx = wp.outer(t, t) * (along - across) + wp.identity(n=3, dtype=scalar) * across
             wp.atomic_add(diagonal_xx, a, xx)
             wp.atomic_add(diagonal_xx, b, xx)
-            wp.atomic_add(upper_xx, stencil * a + direction, -xx)
+            wp.atomic_add(upper_xx, index(stencil * a + direction), -xx)
             if wp.static(sliding):
                 xs = t * (along * ratio)
                 ss = along * ratio * ratio
@@ -134,42 +144,4 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return stretch_energy
 
 
-def define_contact_load(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
-    stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
-
-    @variant.kernel("terms")
-    def stretch_contact_load(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
-        stretch: wp.array(dtype=scalar),
-        radius: wp.array(dtype=scalar),
-        position: wp.array(dtype=vec3),
-        euler: wp.array(dtype=scalar),
-        normal: wp.array(dtype=vec3),
-        contact_load: wp.array(dtype=scalar),
-    ):
-        """½ n·Fₛ of eq. 3, from the uncrimped positions: added for the warp, subtracted for the weft."""
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
-        rest = euler[2 * b + direction] - euler[2 * a + direction]
-        k = stretch_stiffness(stretch[segment_yarn[e]], radius[0])
-        half = scalar(0.5) - scalar(direction)
-        f = stretch_force(position[b] - position[a], rest, k) * half
-        wp.atomic_add(contact_load, a, wp.dot(normal[a], f))
-        wp.atomic_add(contact_load, b, -wp.dot(normal[b], f))
-
-    return stretch_contact_load
-
-
-TERM = Term(
-    name="stretch",
-    elements="segments",
-    define=define,
-    energy=define_energy,
-    stencil=2,
-    contact_load=define_contact_load,
-)
+TERM = Term(name="stretch", elements="segments", define=define, energy=define_energy, stencil=2, presses=True)

@@ -55,7 +55,7 @@ class Term:
 
     name: str
     elements: str
-    """What the kernel runs over: nodes, crossings, segments, bends, corners, triangles or pins."""
+    """What the kernel runs over: nodes, crossings, segments, bends, triangles or pins."""
     define: Callable[[Variant], wp.Kernel]
     energy: Callable[[Variant], wp.Kernel] | None = None
     """The kernel that adds up the term's energy, where it has one."""
@@ -66,5 +66,6 @@ class Term:
     """Whether the term reads the contact force of every crossing."""
     sliding_only: bool = False
     """Whether the term vanishes identically where yarns do not slide."""
-    contact_load: Callable[[Variant], wp.Kernel] | None = None
-    """The kernel that adds what this term presses crossings together with (eq. 3), where it does."""
+    presses: bool = False
+    """Whether the term presses yarns together (eq. 3): its kernel then adds to ``contact_load`` where ``press`` is not
+    0. Such terms stand before those that need the contact."""

@@ -12,6 +12,7 @@ The matrix holds the exact derivative by velocity, which is symmetric positive s
 
 import warp as wp
 
+from .indexing import index
 from .variant import Term, Variant
 
 
@@ -39,10 +40,10 @@ def define(variant: Variant) -> wp.Kernel:
         diagonal_xx: wp.array(dtype=mat33),
         upper_xx: wp.array(dtype=mat33),
     ):
-        e = wp.tid()
-        i = triangle_nodes[e][0]
-        j = triangle_nodes[e][1]
-        k = triangle_nodes[e][2]
+        e = index(wp.tid())
+        i = index(triangle_nodes[e][0])
+        j = index(triangle_nodes[e][1])
+        k = index(triangle_nodes[e][2])
         third = scalar(wp.static(1.0 / 3.0))
         cross = wp.cross(position[j] - position[i], position[k] - position[i])
         area = scalar(0.5) * wp.length(cross)
@@ -68,9 +69,9 @@ def define(variant: Variant) -> wp.Kernel:
             wp.atomic_add(diagonal_xx, j, xx)
             wp.atomic_add(diagonal_xx, k, xx)
             blocks = triangle_blocks[e]
-            wp.atomic_add(upper_xx, blocks[0], xx)
-            wp.atomic_add(upper_xx, blocks[1], xx)
-            wp.atomic_add(upper_xx, blocks[2], xx)
+            wp.atomic_add(upper_xx, index(blocks[0]), xx)
+            wp.atomic_add(upper_xx, index(blocks[1]), xx)
+            wp.atomic_add(upper_xx, index(blocks[2]), xx)
 
     return wind_term
 

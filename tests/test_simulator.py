@@ -162,7 +162,7 @@ def test_a_term_that_is_left_out_has_no_arrays_and_does_nothing() -> None:
     scene = wy.Scene(c, sliding=False, terms=["stretch", "gravity"])
     sim = wy.Simulator(scene)
     assert scene.terms == ("mass", "stretch", "gravity")
-    absent = ("normal", "contact_load", "euler_force", "upper_xs", "anchor", "euler_velocity", "corner_nodes")
+    absent = ("normal", "contact_load", "euler_force", "upper_xs", "anchor", "euler_velocity", "corner_jams")
     assert all(sim.arrays[name] is None for name in absent)
     assert sim.arrays["upper_xx"].size == 2 * c.nodes  # the next crossings of each yarn alone
     assert set(sim.forces()) == {"stretch", "gravity"}

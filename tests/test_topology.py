@@ -22,6 +22,13 @@ def woven(name: str, size: tuple[int, int]) -> tuple[Topology, Oracle]:
     return cloth.topology, Oracle(wy.Scene(cloth, pins=[0]))
 
 
+def corner_nodes(t: Topology) -> np.ndarray:
+    """(warp neighbour, crossing, weft neighbour) of every corner."""
+    left, right, up, down = t.crossing_neighbours.T
+    pairs = ((left, up), (left, down), (right, up), (right, down))
+    return np.stack([np.stack([p, t.crossing_node, r], axis=1) for p, r in pairs], axis=1).reshape(-1, 3)
+
+
 each = pytest.mark.parametrize(("name", "size"), CLOTHS, ids=[f"{name}-{j}x{i}" for name, (j, i) in CLOTHS])
 
 
@@ -35,7 +42,7 @@ def test_counts(name: str, size: tuple[int, int]) -> None:
     assert t.bend_nodes.shape == (rows * (columns - 2) + columns * (rows - 2), 3)
     assert t.crossing_node.shape == ((rows - 2) * (columns - 2),)
     assert t.is_crossing.sum() == len(t.crossing_node)
-    assert t.corner_nodes.shape == (4 * len(t.crossing_node), 3)
+    assert t.corner_jams.shape == t.corner_blocks.shape == (len(t.crossing_node), 4)
     assert t.triangle_nodes.shape == (2 * (rows - 1) * (columns - 1), 3)
     assert all(values.dtype == np.int32 for values in vars(t).values() if isinstance(values, np.ndarray))
 
@@ -56,7 +63,7 @@ def test_elements_are_those_of_rows_and_columns(name: str, size: tuple[int, int]
     assert np.flatnonzero(t.is_crossing).tolist() == t.crossing_node.tolist()
     expected = [[o.node(j, i - 1), o.node(j, i + 1), o.node(j - 1, i), o.node(j + 1, i)] for j, i in o.crossings()]
     assert t.crossing_neighbours.tolist() == expected
-    assert {tuple(n) for n in t.corner_nodes.tolist()} == {tuple(o.node(*at) for at in c) for c in o.corners()}
+    assert {tuple(n) for n in corner_nodes(t).tolist()} == {tuple(o.node(*at) for at in c) for c in o.corners()}
     assert {frozenset(n) for n in t.triangle_nodes.tolist()} == {frozenset(n) for n in o.triangles()}
 
 
@@ -66,6 +73,9 @@ def test_nodes_of_a_yarn_stand_in_order(name: str, size: tuple[int, int]) -> Non
     t, _ = woven(name, size)
     for nodes in (t.segment_nodes, t.bend_nodes):
         assert np.all(np.diff(nodes, axis=1) > 0)
+    # and what shear rests on
+    left, right, up, down = t.crossing_neighbours.T
+    assert np.all(np.diff([up, left, t.crossing_node, right, down], axis=0) > 0)
 
 
 @each
@@ -80,7 +90,7 @@ def test_triangles_all_turn_the_same_way_and_cover_the_cloth(name: str, size: tu
 def test_corners_jam_between_opposite_neighbours(name: str, size: tuple[int, int]) -> None:
     t, o = woven(name, size)
     flipped = np.array(o.flipped).ravel()
-    for (p, c, r), jams in zip(t.corner_nodes, t.corner_jams, strict=True):
+    for (p, c, r), jams in zip(corner_nodes(t), t.corner_jams.ravel(), strict=True):
         assert jams == (flipped[c] != flipped[p] and flipped[c] != flipped[r])
 
 
@@ -99,7 +109,7 @@ def test_blocks_are_those_of_their_pairs(name: str, size: tuple[int, int]) -> No
     """Block 6 n + k couples node n with its upper neighbour k."""
     t, _ = woven(name, size)
     for nodes, blocks, pairs in (
-        (t.corner_nodes, t.corner_blocks, ((0, 1), (1, 2), (0, 2))),
+        (corner_nodes(t), t.corner_blocks.reshape(-1, 1), ((0, 2),)),
         (t.triangle_nodes, t.triangle_blocks, ((0, 1), (1, 2), (2, 0))),
     ):
         for k, pair in enumerate(pairs):

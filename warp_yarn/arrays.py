@@ -46,7 +46,6 @@ class Arrays(dict[str, Any]):
             "segments": len(self["segment_nodes"]),
             "bends": len(self["bend_nodes"]),
             "crossings": len(self["crossing_node"]),
-            "corners": len(self["corner_nodes"]) if self["corner_nodes"] is not None else 0,
             "triangles": len(self["triangle_nodes"]) if self["triangle_nodes"] is not None else 0,
             "pins": len(scene.pins),
             "applied": len(scene.force_nodes),
@@ -63,9 +62,9 @@ class Arrays(dict[str, Any]):
 
     def _topology(self, cloth: Cloth) -> None:
         topology = cloth.topology
-        used = {term.elements for term in self.terms}
-        skipped = {"corners": "corner_", "triangles": "triangle_"}
-        skipped = tuple(prefix for elements, prefix in skipped.items() if elements not in used)
+        used = {term.name for term in self.terms}
+        skipped = {"shear": "corner_", "wind": "triangle_"}
+        skipped = tuple(prefix for term, prefix in skipped.items() if term not in used)
         vectors = {1: wp.int32, 2: wp.vec2i, 3: wp.vec3i, 4: wp.vec4i}
         for name, values in vars(topology).items():
             if name == "neighbour":

@@ -175,21 +175,28 @@ class Model:
         a.zero(*SUMS)
         if matrix:
             a.zero(*MATRIX)
-        self.press()
+        self._find_normals()
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
-            self.launch(term.name, term.elements, matrix=int(matrix and term.name not in explicit), **arrays)
+            filled = int(matrix and term.name not in explicit)
+            self.launch(term.name, term.elements, matrix=filled, press=int(a.contact), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
-    def press(self) -> None:
-        """Fills contact normals and loads, where a term of the scene needs them."""
-        a = self.arrays
-        if a.contact:
-            a.zero("contact_load")
+    def _find_normals(self) -> None:
+        """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
+        if self.arrays.contact:
+            self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
-            for term in a.terms:
-                if term.contact_load is not None:
-                    self.launch(f"{term.name}_contact_load", term.elements)
+
+    def press(self) -> None:
+        """Fills contact normals and loads alone, where a term of the scene needs them."""
+        a = self.arrays
+        self._find_normals()
+        for term in a.terms:
+            if a.contact and term.presses:
+                # the forces go where the solver works
+                unused = {"force": a["q_x"], "euler_force": a["q_s"]}
+                self.launch(term.name, term.elements, matrix=0, press=1, **unused)
 
     def prescribe(self, **replaced: Any) -> None:
         """Gives exact pins the velocity that brings them to their place."""

@@ -35,12 +35,12 @@ class Topology:
     """[nodes]: 1 at a crossing."""
     flipped: np.ndarray
     """[nodes]: the draft."""
-    corner_nodes: np.ndarray
-    """[corners, 3]: warp neighbour p, crossing c, weft neighbour r."""
     corner_jams: np.ndarray
-    """[corners]: 1 where c is flipped against both p and r."""
+    """[crossings, 4]: 1 where a crossing is flipped against both its left and up, left and down, right and up, right
+    and down neighbours."""
     corner_blocks: np.ndarray
-    """[corners, 3]: matrix blocks of p-c, c-r and p-r, in a stencil six wide."""
+    """[crossings, 4]: matrix blocks between the same two neighbours, in a stencil six wide. In the rows of up, left, up
+    and right: nodes are numbered so that up comes before left and right, and these before down."""
     triangle_nodes: np.ndarray
     """[triangles, 3]."""
     triangle_blocks: np.ndarray
@@ -83,11 +83,8 @@ def rectangle(weave: Weave) -> Topology:
     crossing = index[1:-1, 1:-1].ravel()
     left, right, up, down = crossing - 1, crossing + 1, crossing - columns, crossing + columns
     flipped = weave.flipped.astype(np.int32).ravel()
-    corner_nodes = np.stack(
-        [np.stack([p, crossing, r], axis=1) for p in (left, right) for r in (up, down)], axis=1
-    ).reshape(-1, 3)
-    p, c, r = flipped[corner_nodes].T
-    corner_jams = ((c != p) & (c != r)).astype(np.int32)
+    corners = [np.stack([p, r], axis=1) for p in (left, right) for r in (up, down)]
+    jams = [np.all(flipped[pair] != flipped[crossing, None], axis=1) for pair in corners]
 
     # Two triangles to a cell; their diagonal alternates like a checkerboard.
     cell = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1).reshape(-1, 4)
@@ -107,9 +104,8 @@ def rectangle(weave: Weave) -> Topology:
         crossing_neighbours=np.stack([left, right, up, down], axis=1),
         is_crossing=is_crossing,
         flipped=flipped,
-        corner_nodes=corner_nodes,
-        corner_jams=corner_jams,
-        corner_blocks=blocks(corner_nodes, ((0, 1), (1, 2), (0, 2))),
+        corner_jams=np.stack(jams, axis=1).astype(np.int32),
+        corner_blocks=np.concatenate([blocks(pair, ((0, 1),)) for pair in corners], axis=1),
         triangle_nodes=triangle_nodes,
         triangle_blocks=blocks(triangle_nodes, ((0, 1), (1, 2), (2, 0))),
         neighbour=neighbour,
