@@ -32,6 +32,11 @@ class Variant:
     def mat33(self) -> type:
         return wp.types.matrix((3, 3), self.scalar)
 
+    @property
+    def sym33(self) -> type:
+        """A symmetric matrix: 00, 01, 02, 11, 12, 22."""
+        return wp.types.vector(6, self.scalar)
+
     def module(self, name: str) -> str:
         """Name of the Warp module that this variant's kernels of one kind are compiled into.
 
