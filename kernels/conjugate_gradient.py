@@ -36,6 +36,7 @@ def define(variant: Variant) -> SimpleNamespace:
     symmetric, product = incomplete.functions(variant).symmetric, incomplete.functions(variant).product
     total = teams.functions(variant).total
     module = variant.module("conjugate_gradient")
+    variant.fuse("conjugate_gradient")
 
     @wp.func
     def backward_sweep(

@@ -72,6 +72,7 @@ def define(variant: Variant) -> SimpleNamespace:
     at, put = access.functions(variant).at, access.functions(variant).put
     symmetric, congruent = functions(variant).symmetric, functions(variant).congruent
     inverse_of = functions(variant).inverse_of
+    variant.fuse("incomplete")
 
     @wp.kernel(module=variant.module("incomplete"), enable_backward=False)
     def factorize(

@@ -45,6 +45,13 @@ class Variant:
         parts = ["warp_yarn", name, self.scalar.__name__, "sliding" if self.sliding else "locked"]
         return "_".join(parts + ["reverse"] * self.reverse)
 
+    def fuse(self, module: str) -> None:
+        """Lets the CPU's compiler contract a b + c in one of this variant's modules, which Warp's own fuse_fp does not:
+        every operation of a kernel is a statement of its own."""
+        flags = wp.config.cpu_compiler_flags
+        flags = "-march=native" if flags is None else flags
+        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast"}, self.module(module))
+
     def kernel(self, module: str) -> Callable[[Callable], wp.Kernel]:
         """Decorator of a kernel of this variant in one of its modules."""
         return wp.kernel(module=self.module(module), enable_backward=self.reverse)
