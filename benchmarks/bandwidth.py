@@ -53,17 +53,15 @@ SHORT, LONG = 3, 13
 MATRIX = "neighbour upper_xx upper_xs upper_sx upper_ss"
 PASSES = {
     "incomplete": (
-        # (read, written): p ← q + β p, q ← 0, t = (E + U)⁻¹ p
-        (f"{MATRIX} inverse_pivot inverse_s p_x p_s q_x q_s", "p_x p_s q_x q_s t_x t_s"),
-        # q = t + (E + U)⁻ᵀ (p + (D − 2E) t)
+        # (read, written): p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t
         (
-            f"{MATRIX} diagonal_xx diagonal_xs diagonal_ss pivot inverse_pivot inverse_s p_x p_s t_x t_s q_x q_s",
-            "q_x q_s",
+            f"{MATRIX} diagonal_xx diagonal_xs diagonal_ss inverse_pivot inverse_s r_x r_s p_x p_s",
+            "p_x p_s t_x t_s q_x q_s",
         ),
-        # solution += α t, r −= α q, q = E r
+        # q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q
         (
-            "solution euler_solution t_x t_s r_x r_s q_x q_s pivot diagonal_ss",
-            "solution euler_solution r_x r_s q_x q_s",
+            f"{MATRIX} inverse_pivot inverse_s t_x t_s q_x q_s solution euler_solution r_x r_s",
+            "q_x q_s solution euler_solution r_x r_s",
         ),
     ),
     "jacobi": (

@@ -11,6 +11,7 @@ from . import (
     adjoint,
     applied,
     bending,
+    conjugate_gradient,
     contact,
     friction,
     gravity,
@@ -61,6 +62,6 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     for part in (step, ros2):
         kernels |= vars(part.define_reversible(variant))
-    for part in (step, solver, incomplete, history, adjoint, stage, ros2):
+    for part in (step, solver, incomplete, conjugate_gradient, history, adjoint, stage, ros2):
         kernels |= vars(part.define(variant.forward))
     return kernels

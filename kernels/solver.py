@@ -11,7 +11,8 @@ couples positions alone. A slot that a scene's terms do not fill is not stored (
                                        upper_ss [4·node + slot]        1
 
 Two preconditioners P. Here the diagonal of A (``jacobi``): every node on its own, so it is what a parallel machine
-wants. In ``incomplete.py`` one that takes a twelfth of the iterations, node after node.
+wants. In ``incomplete.py`` one that takes a twelfth of the iterations, node after node, and in
+``conjugate_gradient.py`` the iteration with it.
 """
 
 import functools
@@ -19,14 +20,90 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import access
 from .step import NOT_CONVERGED, NOT_FINITE
 from .variant import Variant
 
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """What both preconditioned iterations share."""
+    """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    at, put = access.functions(variant).at, access.functions(variant).put
+
+    @wp.func
+    def times(m: mat33, x: vec3) -> vec3:
+        """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
+        return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
+
+    @wp.func
+    def gather(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+        s: wp.array(dtype=scalar),
+    ):
+        """Row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
+        y = vec3()
+        y_u = scalar(0.0)
+        y_v = scalar(0.0)
+        for turn in range(6):
+            slot = 5 - turn
+            if slot < stencil:
+                k = stencil * i + slot
+                j = at(neighbour, k)
+                if j >= 0:
+                    its = at(x, j)
+                    y += times(at(upper_xx, k), its)
+                    if wp.static(sliding):
+                        if slot < 4:
+                            e = 4 * i + slot
+                            along = at(s, 2 * j + slot % 2)
+                            y += at(upper_xs, e) * along
+                            row = wp.dot(at(upper_sx, e), its) + at(upper_ss, e) * along
+                            if slot % 2 == 0:
+                                y_u += row
+                            else:
+                                y_v += row
+        return y, y_u, y_v
+
+    @wp.func
+    def spread(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        x: vec3,
+        u: scalar,
+        v: scalar,
+        y_x: wp.array(dtype=vec3),
+        y_s: wp.array(dtype=scalar),
+    ):
+        """y −= Uᵀ (x, u, v), what row i of U gives to others."""
+        for slot in range(6):
+            if slot < stencil:
+                k = stencil * i + slot
+                j = at(neighbour, k)
+                if j >= 0:
+                    y = at(y_x, j) - x * at(upper_xx, k)
+                    if wp.static(sliding):
+                        if slot < 4:
+                            e = 4 * i + slot
+                            mine = u
+                            if slot % 2 == 1:
+                                mine = v
+                            y -= at(upper_sx, e) * mine
+                            its = 2 * j + slot % 2
+                            put(y_s, its, at(y_s, its) - wp.dot(at(upper_xs, e), x) - at(upper_ss, e) * mine)
+                    put(y_x, j, y)
 
     @wp.func
     def multiply(
@@ -46,48 +123,22 @@ def functions(variant: Variant) -> SimpleNamespace:
         q_s: wp.array(dtype=scalar),
     ):
         """q += A p. One pass: a row adds its upper half to itself, and the transposed blocks to its neighbours."""
+        u = scalar(0.0)
+        v = scalar(0.0)
         for i in range(nodes):
-            x = p_x[i]
-            y = q_x[i] + diagonal_xx[i] * x
+            x = at(p_x, i)
+            y, y_u, y_v = gather(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s)
+            y += times(at(diagonal_xx, i), x)
             if wp.static(sliding):
-                u = p_s[2 * i]
-                v = p_s[2 * i + 1]
-                xs_u = diagonal_xs[2 * i]
-                xs_v = diagonal_xs[2 * i + 1]
+                u = at(p_s, 2 * i)
+                v = at(p_s, 2 * i + 1)
+                xs_u = at(diagonal_xs, 2 * i)
+                xs_v = at(diagonal_xs, 2 * i + 1)
                 y += xs_u * u + xs_v * v
-                y_u = q_s[2 * i] + wp.dot(xs_u, x) + diagonal_ss[2 * i] * u
-                y_v = q_s[2 * i + 1] + wp.dot(xs_v, x) + diagonal_ss[2 * i + 1] * v
-            for slot in range(stencil):
-                k = stencil * i + slot
-                j = neighbour[k]
-                if j >= 0:
-                    block = upper_xx[k]
-                    y += block * p_x[j]
-                    q_x[j] = q_x[j] + x * block
-            if wp.static(sliding):
-                for slot in range(4):
-                    if slot < stencil:
-                        j = neighbour[stencil * i + slot]
-                        if j >= 0:
-                            k = 4 * i + slot
-                            s = 2 * j + slot % 2
-                            xs = upper_xs[k]
-                            sx = upper_sx[k]
-                            ss = upper_ss[k]
-                            mine = u
-                            if slot % 2 == 1:
-                                mine = v
-                            y += xs * p_s[s]
-                            q_s[s] = q_s[s] + wp.dot(xs, x) + ss * mine
-                            row = wp.dot(sx, p_x[j]) + ss * p_s[s]
-                            if slot % 2 == 0:
-                                y_u += row
-                            else:
-                                y_v += row
-                            q_x[j] = q_x[j] + sx * mine
-                q_s[2 * i] = y_u
-                q_s[2 * i + 1] = y_v
-            q_x[i] = y
+                put(q_s, 2 * i, at(q_s, 2 * i) + y_u + wp.dot(xs_u, x) + at(diagonal_ss, 2 * i) * u)
+                put(q_s, 2 * i + 1, at(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + at(diagonal_ss, 2 * i + 1) * v)
+            put(q_x, i, at(q_x, i) + y)
+            spread(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, -x, -u, -v, q_x, q_s)
 
     @wp.func
     def report(
@@ -107,7 +158,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
         return True
 
-    return SimpleNamespace(multiply=multiply, report=report)
+    return SimpleNamespace(times=times, gather=gather, spread=spread, multiply=multiply, report=report)
 
 
 @functools.cache

@@ -32,6 +32,11 @@ class Variant:
     def mat33(self) -> type:
         return wp.types.matrix((3, 3), self.scalar)
 
+    @property
+    def sym33(self) -> type:
+        """A symmetric matrix: 00, 01, 02, 11, 12, 22."""
+        return wp.types.vector(6, self.scalar)
+
     def module(self, name: str) -> str:
         """Name of the Warp module that this variant's kernels of one kind are compiled into.
 
@@ -39,6 +44,13 @@ class Variant:
         """
         parts = ["warp_yarn", name, self.scalar.__name__, "sliding" if self.sliding else "locked"]
         return "_".join(parts + ["reverse"] * self.reverse)
+
+    def fuse(self, module: str) -> None:
+        """Lets the CPU's compiler contract a b + c in one of this variant's modules, which Warp's own fuse_fp does not:
+        every operation of a kernel is a statement of its own."""
+        flags = wp.config.cpu_compiler_flags
+        flags = "-march=native" if flags is None else flags
+        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast"}, self.module(module))
 
     def kernel(self, module: str) -> Callable[[Callable], wp.Kernel]:
         """Decorator of a kernel of this variant in one of its modules."""

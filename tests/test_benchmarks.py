@@ -247,12 +247,11 @@ def test_the_passes_have_every_array_of_the_iteration(preconditioner):
 
 
 def test_bytes_of_an_iteration_without_sliding():
-    # a node's: blocks 72, vectors 24, six neighbours
-    neighbours, blocks, vector, block = 6 * 4, 6 * 72, 24, 72
+    # a node's: blocks 72, vectors 24, six neighbours, half an E⁻¹
+    neighbours, blocks, vector, block, inverse = 6 * 4, 6 * 72, 24, 72, 6 * 8
     expected = {
-        "incomplete": (neighbours + blocks + block + (2 + 3) * vector)
-        + (neighbours + blocks + 3 * block + (3 + 1) * vector)
-        + (block + (4 + 3) * vector),
+        "incomplete": (neighbours + blocks + block + inverse + (2 + 3) * vector)
+        + (neighbours + blocks + inverse + (4 + 3) * vector),
         "jacobi": (neighbours + blocks + block + 3 * vector) + 2 * vector + (5 + 3) * vector + 4 * vector,
     }
     for preconditioner, each in expected.items():

@@ -138,8 +138,7 @@ class Arrays(dict[str, Any]):
             self[name] = self.zeros(2 * n, scalar) if sliding else None
         self["friction_force_out"] = self.zeros(2 * n, scalar) if self["anchor"] is not None else None
         self["diagonal_xx"] = self.zeros(n, mat33)
-        self["pivot"] = self.zeros(n, mat33)
-        self["inverse_pivot"] = self.zeros(n, mat33)
+        self["inverse_pivot"] = self.zeros(n, self.variant.sym33)
         self["upper_xx"] = self.zeros(self.stencil * n, mat33)
         for name, count, dtype in (
             ("diagonal_xs", 2 * n, vec3),

@@ -89,13 +89,15 @@ class Simulator:
         fitting = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
         self.chunk = fitting if chunk is None else whole("chunk", chunk, least=1)
         self.arrays.add_frames(self.chunk + 1)
-        self.state = self._rest()
+        # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
+        self._upload(self._rest())
 
     # -- state -------------------------------------------------------------------------------------------------------
 
     def _rest(self) -> State:
         cloth = self.scene.cloth
-        return State(cloth.position, cloth.euler, np.zeros((cloth.nodes, 3)), np.zeros((cloth.nodes, 2)))
+        euler, still = cloth.euler, np.zeros((cloth.nodes, 3))
+        return State(cloth.position, euler, still, still[:, :2], anchor=euler)
 
     @property
     def state(self) -> State:
