@@ -59,8 +59,8 @@ def define(variant: Variant) -> wp.Kernel:
         wp.atomic_add(force, k, f)
 
         if matrix != 0:
-            damping = wp.outer(n, n) * (scalar(2.0) * pressure - drag) + wp.identity(n=3, dtype=scalar) * drag
-            xx = damping * (weights[0][1] * third * third)
+            h = weights[0][1] * third * third
+            xx = wp.outer(n, n) * ((scalar(2.0) * pressure - drag) * h) + wp.identity(n=3, dtype=scalar) * (drag * h)
             p = xx * (mean_velocity * scalar(3.0))
             wp.atomic_add(momentum, i, p)
             wp.atomic_add(momentum, j, p)
