@@ -21,7 +21,7 @@ import warp as wp
 
 from . import access, incomplete, solver
 from . import team as teams
-from .team import call, follow_backwards, follow_forwards, meet, share, tell, wait_for_call
+from .team import call, ended, keep_pace, meet, share, wait_for_call
 from .variant import Variant
 
 
@@ -77,7 +77,8 @@ def define(variant: Variant) -> SimpleNamespace:
             begin = (rows - 1 - row) * columns + first
             for step in range(width):
                 column = width - 1 - step
-                follow_backwards(team, strip, strips, column, width, swept + row)
+                if strips > 1:
+                    keep_pace(team, strip, strip + 1, strip - 1, strips, step, width, swept + row)
                 i = begin + column
                 w, w_u, w_v = gather(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, t_x, t_s)
                 p = at(r_x, i) + at(p_x, i) * beta
@@ -105,7 +106,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 put(q_x, i, q)
                 curvature += wp.dot(t, q + w)
             if strips > 1:
-                tell(team, strip, swept + row + 1)
+                ended(team, strip, swept + row + 1)
         return curvature
 
     @wp.func
@@ -143,7 +144,8 @@ def define(variant: Variant) -> SimpleNamespace:
         for row in range(nodes / columns):
             begin = row * columns + first
             for column in range(width):
-                follow_forwards(team, strip, strips, column, width, swept + row)
+                if strips > 1:
+                    keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
                 i = begin + column
                 inverse = at(inverse_pivot, i)
                 t = at(t_x, i)
@@ -171,7 +173,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 put(r_x, i, r)
                 rz += wp.dot(r, product(inverse, r))
             if strips > 1:
-                tell(team, strip, swept + row + 1)
+                ended(team, strip, swept + row + 1)
         return rz
 
     @wp.kernel(module=module, enable_backward=False)
@@ -262,7 +264,8 @@ def define(variant: Variant) -> SimpleNamespace:
             y_v = zero
             for row in range(rows):
                 for column in range(width):
-                    follow_forwards(team, strip, strips, column, width, swept + row)
+                    if strips > 1:
+                        keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
                     i = row * columns + first + column
                     inverse = at(inverse_pivot, i)
                     x = vec3()
@@ -305,7 +308,7 @@ def define(variant: Variant) -> SimpleNamespace:
                         y + x, y_u + u, y_v + v, r_x, r_s,
                     )  # fmt: skip
                 if strips > 1:
-                    tell(team, strip, swept + row + 1)
+                    ended(team, strip, swept + row + 1)
             swept += rows
             rz = total(rz, 1, strip, strips, met + strips, team, sums)
             size = total(size, 2, strip, strips, met + 2 * strips, team, sums)

@@ -1,13 +1,13 @@
 """Processor cores that share a linear solve, each with a strip of the cloth's columns.
 
 A sweep goes along the rows, one after the other, and a strip follows its neighbours: forwards, it begins a row when the
-strip before has ended it, and ends it when the strip behind has ended the last one; backwards the other way round. So
-they all work, one row apart, and what they compute is what one core does. They run one kernel at the same time, and
-``team`` is where they meet:
+strip before has ended it, and ends it when the strip behind has begun the last one, by ``EDGE`` nodes; backwards the
+other way round. So they all work, a row or two apart, and what they compute is what one core does. They run one kernel
+at the same time, and ``team`` is where they meet:
 
     team[0] how often strips came to a meeting   team[1] the number of the solve   team[2] 1: helpers are to go home
     team[3] how many strips                      team[4] the last helper to wait   team[5] team[0] before the solve
-    team[16 + 16 k] rows that strip k has swept, of all sweeps
+    team[16 + 16 k] rows that strip k has ended, of all sweeps, and team[17 + 16 k] those that it has begun
 
 A GPU has one strip and never waits.
 """
@@ -18,6 +18,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from .variant import Variant
+
+EDGE = 3
+"""Nodes of a row that share neighbours with the next strip: the matrix couples second next ones."""
 
 _MEET = """
 #if !defined(__CUDA_ARCH__)
@@ -38,14 +41,24 @@ _AWAIT = """
            && !__atomic_load_n(&team.data[2], __ATOMIC_ACQUIRE)) {}
 #endif
 """
-_SWEPT = """
+_ENDED = """
 #if !defined(__CUDA_ARCH__)
     __atomic_store_n(&team.data[16 + 16 * strip], rows, __ATOMIC_RELEASE);
 #endif
 """
-_FOLLOW = """
+_BEGUN = """
+#if !defined(__CUDA_ARCH__)
+    __atomic_store_n(&team.data[17 + 16 * strip], rows, __ATOMIC_RELEASE);
+#endif
+"""
+_UNTIL_ENDED = """
 #if !defined(__CUDA_ARCH__)
     while (__atomic_load_n(&team.data[16 + 16 * strip], __ATOMIC_ACQUIRE) < rows) {}
+#endif
+"""
+_UNTIL_BEGUN = """
+#if !defined(__CUDA_ARCH__)
+    while (__atomic_load_n(&team.data[17 + 16 * strip], __ATOMIC_ACQUIRE) < rows) {}
 #endif
 """
 
@@ -68,15 +81,27 @@ def meet(team: wp.array(dtype=int), goal: int):
     ...
 
 
-@wp.func_native(_SWEPT)
-def tell(team: wp.array(dtype=int), strip: int, rows: int):
-    """Tells the other strips how many rows this one has swept."""
+@wp.func_native(_ENDED)
+def ended(team: wp.array(dtype=int), strip: int, rows: int):
+    """Tells the other strips how many rows this one has ended."""
     ...
 
 
-@wp.func_native(_FOLLOW)
-def follow(team: wp.array(dtype=int), strip: int, rows: int):
-    """Waits until a strip has swept so many rows."""
+@wp.func_native(_BEGUN)
+def begun(team: wp.array(dtype=int), strip: int, rows: int):
+    """Tells the other strips in how many rows this one is past its first nodes."""
+    ...
+
+
+@wp.func_native(_UNTIL_ENDED)
+def until_ended(team: wp.array(dtype=int), strip: int, rows: int):
+    """Waits until a strip has ended so many rows."""
+    ...
+
+
+@wp.func_native(_UNTIL_BEGUN)
+def until_begun(team: wp.array(dtype=int), strip: int, rows: int):
+    """Waits until a strip is past its first nodes of so many rows."""
     ...
 
 
@@ -87,22 +112,23 @@ def share(whole: int, strip: int, strips: int) -> int:
 
 
 @wp.func
-def follow_backwards(team: wp.array(dtype=int), strip: int, strips: int, column: int, width: int, rows: int):
-    """Waits until a backward sweep, rows of all sweeps behind it, may go to a column of its row."""
-    if strip + 1 < strips and column == width - 1:
-        follow(team, strip + 1, rows + 1)
-    if strip > 0 and column == 0:
-        follow(team, strip - 1, rows)
+def keep_pace(
+    team: wp.array(dtype=int), strip: int, before: int, behind: int, strips: int, step: int, width: int, rows: int
+):
+    """Comes before the step-th node of a row, when a strip has swept so many rows; waits until it may be taken.
 
-
-@wp.func
-def follow_forwards(team: wp.array(dtype=int), strip: int, strips: int, column: int, width: int, rows: int):
-    """As ``follow_backwards``. The last three columns spread to some that the strip behind spreads to from the row
-    before."""
-    if strip > 0 and column == 0:
-        follow(team, strip - 1, rows + 1)
-    if strip + 1 < strips and column == width - 3:
-        follow(team, strip + 1, rows)
+    The strip before is the one that this one takes up a row from, that behind the one which takes it up.
+    Forwards, the last nodes of a row spread to some that the strip behind spreads to from the first of the row before;
+    backwards, they read what it made there. Further on in its row it touches none of theirs, so it may lag by one.
+    """
+    if step == 0:
+        if before >= 0 and before < strips:
+            until_ended(team, before, rows + 1)
+    if step == wp.static(EDGE):
+        begun(team, strip, rows + 1)
+    if step == width - wp.static(EDGE):
+        if behind >= 0 and behind < strips:
+            until_begun(team, behind, rows)
 
 
 @functools.cache

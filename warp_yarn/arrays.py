@@ -198,7 +198,8 @@ class Arrays(dict[str, Any]):
         return self[label]
 
     def add_frames(self, count: int) -> None:
-        """Makes room for so many frames of the state, as ``frame_position`` and so on."""
+        """Makes room for so many frames of what moves, as ``frame_position`` and so on."""
         for name in STATE_TYPES:
             array = self[name]
-            self[f"frame_{name}"] = None if array is None else self.zeros(count * array.shape[0], array.dtype)
+            still = array is None or (name == "euler" and not self.variant.sliding)
+            self[f"frame_{name}"] = None if still else self.zeros(count * array.shape[0], array.dtype)

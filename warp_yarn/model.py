@@ -100,7 +100,7 @@ class Model:
         self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
 
     def _form_team(self, threads: int) -> None:
-        """Strips of the cloth for so many processor cores (``kernels/incomplete.py``)."""
+        """Strips of the cloth for so many processor cores (``kernels/team.py``)."""
         a = self.arrays
         if threads > 1 and not (self.device.is_cpu and self.preconditioner == "incomplete"):
             raise InputError(
