@@ -74,6 +74,24 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_increment[s] = base_euler_velocity[s] - rate
 
     @wp.kernel(module=module, enable_backward=False)
+    def look_ahead(
+        segment_nodes: wp.array(dtype=wp.vec2i),
+        segment_yarn: wp.array(dtype=int),
+        yarn_direction: wp.array(dtype=int),
+        stage_size: wp.array(dtype=scalar),
+        base_euler: wp.array(dtype=scalar),
+        euler_solution: wp.array(dtype=scalar),
+        crosses: wp.array(dtype=int),
+    ):
+        """Whether crossings would pass each other at the velocity that the iteration starts from."""
+        e = wp.tid()
+        direction = yarn_direction[segment_yarn[e]]
+        sa = 2 * segment_nodes[e][0] + direction
+        sb = 2 * segment_nodes[e][1] + direction
+        if base_euler[sb] - base_euler[sa] + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
+            crosses[0] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
     def correct(
         step_length: wp.array(dtype=scalar),
         solution_before: wp.array(dtype=vec3),
@@ -424,6 +442,7 @@ def define(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         enter_stage=enter_stage,
+        look_ahead=look_ahead,
         correct=correct,
         search=search,
         judge=judge,

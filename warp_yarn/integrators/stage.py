@@ -53,7 +53,7 @@ class StageMethod:
         a["base_euler"] = a.zeros(2 * n, scalar)
         for name in ("size", "slope"):
             a[name] = a.zeros(1, scalar)
-        for name in ("tries", "continues", "solves", "refreshes", "newton_iterations"):
+        for name in ("tries", "continues", "solves", "refreshes", "crosses", "newton_iterations"):
             a[name] = a.zeros(1, wp.int32)
         for name in ("stage_size", "carried_time"):
             a[name] = a.zeros(1, scalar)
@@ -153,6 +153,10 @@ class StageMethod:
         turn."""
         a = self.model.arrays
         a.zero("tries", "direction", "euler_direction")
+        if self.model.scene.sliding:
+            a.zero("crosses")
+            self.model.launch("look_ahead", "segments")
+            wp.capture_if(a["crosses"], on_true=lambda: a.zero("euler_solution"))
         if first:
             self._evaluate(matrix=True)
         else:
