@@ -8,25 +8,26 @@
 
 Fabrics are simulated with known yarns and a hard friction (ground_truth.py), and learned from frames by
 warp_yarn.learn, from the starts and within the ranges of the paper. "same" ground truth has the model's step and
-method, "finer" a step ten times finer. Tables go to benchmarks/results/paper_*.csv, charts to docs/paper_*.png.
+method, "finer" a step ten times finer; learning begins with 1 ms, and halves it up to three times where the frames ask
+for that ("step [ms]" is the last one). Tables go to benchmarks/results/paper_*.csv, charts to docs/paper_*.png.
 
 "found" is where the model fits the frames best, "ours" the value without what learning takes for its time step's part
 (Result.corrected). Errors are relative to the true value, and so is "uncertainty", the standard deviation that learning
 gives; "status" is whether the data determine the parameter. "ratio" is how many times the paper's error is that of
-ours. "runs" are simulations, and a gradient counts as another.
+ours. "runs" are simulations in units of those at 1 ms, so that one at 0.5 ms counts as two; a gradient is another.
 
 table4: errors are means over --test frames and all nodes of the squared distance [1e-6 m²]. The baselines have 140 runs
 each, as in the paper: Bayesian optimization (bayesian.py; pip install bayesian-optimization) the same model, ranges and
 frames; the sheet (sheet.py; pip install newton) the same pose, pins and wind. Without Newton the sheet is left out.
-"refined" is the prediction of ours (not of "found") with a step of 0.25 ms, for "finer" ground truth.
+Ours predicts with the values "found" and the step that they were found with.
 
 figure6: errors by frames to learn from; and, with what the last of these gave, by time over 2000 frames, and of 500
 frames of cloths with 2 and 4 times as many yarns in each direction. The paper has no numbers of it, and does not say
 from how many frames it learned; nor does its table 3 say on how many yarns: 17 × 17 here, as in its table 4.
 
 bias: what each integrator finds with some steps from the "finer" ground truth, and at 1 ms from the paper's published
-data (--data, an HDF5 file), which were made with eq. 2 at 1 ms. "residual" is the root mean square distance that is
-left, relative to the motion.
+data (--data, an HDF5 file), which were made with eq. 2 at 1 ms; steps are not halved. "residual" is the root mean
+square distance that is left, relative to the motion.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def learned(
             value = papers[len(rows)]
             error = value / row["true"] - 1.0
             theirs = {"paper": value, "paper's error": error, "ratio": ratio(error, row["error"])}
-        rows.append({**about, **row, **theirs})
+        rows.append({**about, **row, "step [ms]": 1e3 * result.task.step, **theirs})
     return rows
 
 
@@ -110,7 +110,7 @@ def bias(options: argparse.Namespace) -> Iterator[list[dict[str, Any]]]:
         try:
             what = {"frames": options.frames, "first": first, "step": step, "integrator": method}
             task = Task(scene, target, PARAMETERS, **what, **TIGHT)
-            result = learn(task, progress=True)
+            result = learn(task, halvings=0, progress=True)
         except wy.SimulationError as error:
             print(f"{method} cannot start with this step: {error}")
             continue

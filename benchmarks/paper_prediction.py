@@ -20,13 +20,9 @@ import warp_yarn as wy
 from warp_yarn import paper
 from warp_yarn.learn import Task, learn, with_values
 
-METHODS = ("ours", "refined", "BO", "sheet")
-"""refined: our values without the step's part, simulated with a finer step; where the ground truth has a finer step."""
+METHODS = ("ours", "BO", "sheet")
 
-BASELINES = METHODS[2:]
-
-REFINED = 4
-"""Steps a frame of the refined prediction."""
+BASELINES = METHODS[1:]
 
 TABLE_4 = {
     ("plain (1, 2)", 5): {"ours": 1.152e-4, "BO": 0.512, "sheet": 1.461},
@@ -65,7 +61,7 @@ def prediction_error(predicted: np.ndarray, truth: np.ndarray) -> float:
 
 
 def of_yarns(
-    fabric: Fabric, values: Mapping[str, float], times: int = 1, **options: Any
+    fabric: Fabric, values: Mapping[str, float], times: int, **options: Any
 ) -> Callable[[int, int], np.ndarray]:
     """The prediction of our model with these values and so many steps a frame."""
 
@@ -81,29 +77,24 @@ def of_yarns(
     return predict
 
 
-def methods(
-    fabric: Fabric, kind: str, size: int, target: wy.Trajectory, runs: int, **options: Any
-) -> dict[str, Learned]:
+def methods(fabric: Fabric, size: int, target: wy.Trajectory, runs: int, **options: Any) -> dict[str, Learned]:
     """Those of METHODS that there are, after learning from the same frames; the sheet only where Newton is installed.
 
     Args:
-        kind: of ground truth.
         target: the rest and the frames to learn from.
         runs: simulations that the baselines may use.
     """
     model, positions = fabric.model(size), target.position[1:]
     result = learn(Task(model, target, PARAMETERS, **options), progress=True)
-    cost = (result.simulations + result.gradients, result.seconds)
-    found = {"ours": Learned(*cost, of_yarns(fabric, result.values, **options))}
-    if kind == "finer":
-        found["refined"] = Learned(*cost, of_yarns(fabric, result.corrected, REFINED, **options))
+    ours = of_yarns(fabric, result.values, result.task.steps_per_frame, **options)
+    found = {"ours": Learned(result.simulations + result.gradients, result.seconds, ours)}
 
     begin = time.perf_counter()
     task = Task(model, target, PARAMETERS, **options)
     still = mean_square(positions, target.position[0])
     best = bayesian.minimize(task.loss, task.low, task.high, runs, failed=still)
     values = dict(zip(NAMES, best.tolist(), strict=True))
-    found["BO"] = Learned(task.simulations, time.perf_counter() - begin, of_yarns(fabric, values, **options))
+    found["BO"] = Learned(task.simulations, time.perf_counter() - begin, of_yarns(fabric, values, 1, **options))
 
     if sheet.available():
         begin = time.perf_counter()
@@ -128,7 +119,7 @@ def table4(options: argparse.Namespace) -> Iterator[list[dict[str, Any]]]:
             truth = fabric.truth(size, max(options.test, *options.frames), kind, **simulator)
             for frames in options.frames:
                 about = case(fabric, kind, size, frames)
-                found = methods(fabric, kind, size, truth.cut(frames + 1), options.runs, **simulator)
+                found = methods(fabric, size, truth.cut(frames + 1), options.runs, **simulator)
                 columns = prediction_columns(
                     found, truth.cut(options.test + 1), size, TABLE_4.get((fabric.name, frames), {})
                 )
@@ -176,7 +167,7 @@ def figure6(options: argparse.Namespace) -> Iterator[list[dict[str, Any]]]:
     found: dict[str, Learned] = {}
     for frames in options.frames:
         case(fabric, kind, size, frames)
-        found = methods(fabric, kind, size, truth.cut(frames + 1), options.runs, **simulator)
+        found = methods(fabric, size, truth.cut(frames + 1), options.runs, **simulator)
         yield errors("frames", frames, found, size, truth.position[1 : options.test + 1])
 
     case(fabric, kind, size, options.long)
@@ -199,7 +190,7 @@ def plot_figure6(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         "time": ("frames of 1 ms", "error at that frame [m²]"),
         "size": ("size, relative to that learned on", "error of prediction [m²]"),
     }
-    names = {"ours": "ours", "refined": "ours, refined", "BO": "Bayesian optimization", "sheet": "sheet (Newton)"}
+    names = {"ours": "ours", "BO": "Bayesian optimization", "sheet": "sheet (Newton)"}
     figure = Figure(figsize=(12.0, 4.0), layout="constrained")
     for axes, (panel, (x, y)) in zip(figure.subplots(1, 3), labels.items(), strict=True):
         for name, color, marker in zip(METHODS, COLORS, MARKERS, strict=False):

@@ -60,7 +60,8 @@ def parser() -> argparse.ArgumentParser:
     add("--frames", type=int, help="how many to learn from, after the first (25, or all where there are fewer)")
     add("--first", type=int, help="frame to start from (0; 1 of a published file, whose pins act from there on)")
     add("--every", type=int, default=1, help="take every so many-th frame only (%(default)s)")
-    add("--step", type=float, metavar="SECONDS", help="time step of the model (the time between frames)")
+    add("--step", type=float, metavar="SECONDS", help="time step of the model to begin with (the time between frames)")
+    add("--halvings", type=int, default=3, help="of the step at most, where its error asks for them (%(default)s)")
     add("--integrator", choices=INTEGRATORS, help="method of the model (the simulator's default)")
     add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of a recording, which has none, m/s (0 5 0)")
     add("--iterations", type=int, default=100, help="at most (%(default)s)")
@@ -107,12 +108,18 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         raise wy.InputError(f"--resume: there is no {checkpoint} to go on from")
     try:
         result = learn(
-            task, iterations=options.iterations, resolution=options.resolution, checkpoint=checkpoint, progress=True
+            task,
+            iterations=options.iterations,
+            resolution=options.resolution,
+            halvings=options.halvings,
+            checkpoint=checkpoint,
+            progress=True,
         )
     except KeyboardInterrupt:
         if checkpoint.exists():
             print(f"\nThe same command with --resume goes on from {checkpoint}.", file=sys.stderr)
         raise
+    task = result.task  # its step may be shorter now
     numbers = summary(task, result, options.file)
     with whole_file(options.result) as temporary:
         temporary.write_text(json.dumps(numbers, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -200,6 +207,7 @@ def summary(task: Task, result: Result, file: Path) -> dict[str, Any]:
         "losses [m²]": [i.loss for i in result.history],
         "paths": {p.name: [float(i.values[k]) for i in result.history] for k, p in enumerate(result.parameters)},
         "simulations by iteration": [i.simulations for i in result.history],
+        "steps [s]": [i.step for i in result.history],
     }
 
 
@@ -300,6 +308,11 @@ def tell(task: Task, result: Result) -> None:
         f"{1e6 * np.sqrt((moved**2).sum(axis=1).mean()):.3g} µm (root mean squares); "
         f"{result.simulations} simulations, {result.gradients} gradient, {result.seconds:.1f} s"
     )
+    if task.step < result.history[0].step:
+        print(
+            f"the data look as if made with a shorter step than {1e3 * result.history[0].step:g} ms: the model's was "
+            f"halved to {1e3 * task.step:g} ms, and a run with that counts as {task.cost}"
+        )
     if result.step_share > 0.5:
         print("the data look as if made with a shorter step than the model's: see the values without its error")
 

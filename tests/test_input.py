@@ -1,5 +1,6 @@
 """Bad input: every refusal names the argument, its value and what is allowed."""
 
+import pickle
 from collections.abc import Callable
 
 import numpy as np
@@ -116,6 +117,29 @@ def test_a_step_that_is_not_finite_says_where_and_keeps_the_frames() -> None:
     assert error.value.step == 1 and len(error.value.trajectory) == 1
     assert 0 <= error.value.node < CLOTH.nodes and error.value.term in SCENE.terms
     assert np.array_equal(sim.state.velocity, velocity)  # it stays at the last good frame
+
+
+def test_errors_pass_from_process_to_process() -> None:
+    velocity = np.zeros((CLOTH.nodes, 3))
+    velocity[6] = 1e200
+    sim = wy.Simulator(SCENE)
+    sim.state = state(velocity=velocity)
+    with pytest.raises(wy.SimulationError) as failure:
+        sim.run(1)
+    failed = failure.value
+    failed.add_note("in a benchmark")
+    copied = pickle.loads(pickle.dumps(failed))
+    assert type(copied) is wy.SimulationError and str(copied) == str(failed)
+    assert (copied.step, copied.node, copied.term) == (failed.step, failed.node, failed.term)
+    assert copied.__notes__ == ["in a benchmark"]
+    np.testing.assert_array_equal(copied.trajectory.position, failed.trajectory.position)
+    gradient = pickle.loads(pickle.dumps(wy.GradientError("not finite", step=2, term="bending")))
+    assert (type(gradient), str(gradient), gradient.step, gradient.term) == (
+        wy.GradientError,
+        "not finite",
+        2,
+        "bending",
+    )
 
 
 def test_crossings_that_meet_stop_the_run() -> None:

@@ -92,6 +92,7 @@ REFUSED = {
     ),
     "NaN": (lambda: task(with_nan(motion(frames=2))), r"target\.position\[1, 3, 2\] is nan, must be finite"),
     "iterations": (lambda: learn(task(motion(frames=1)), iterations=-1), "iterations = -1"),
+    "halvings": (lambda: learn(task(motion(frames=1)), halvings=-1), "halvings = -1"),
     "resolution": (lambda: learn(task(motion(frames=1)), resolution=0.0), r"resolution = 0\.0.*above 0"),
     "checkpoint": (lambda: learn(task(motion(frames=1)), checkpoint="a.json"), r"'a\.json', must end in \.npz"),
 }
@@ -274,12 +275,18 @@ def test_a_start_that_cannot_be_simulated_raises(data):
         learn(problem)
 
 
-@pytest.mark.parametrize("after", [1, 3])
-def test_a_resumed_run_ends_where_an_uninterrupted_one_ends(data, tmp_path, after):
+@pytest.mark.parametrize(("after", "times"), [(1, 1), (3, 1), (5, 4)])
+def test_a_resumed_run_ends_where_an_uninterrupted_one_ends(tmp_path, after, times):
     rng = np.random.default_rng(0)
-    noisy = dataclasses.replace(data, position=data.position + 1e-6 * rng.normal(size=data.position.shape))
-    whole = learn(task(noisy))
-    assert len(whole.history) > 4
+    fine = motion(with_values(SCENE, COULOMB), frames=FRAMES * times, step=1e-3 / times)
+    noisy = dataclasses.replace(fine, position=fine.position + 1e-7 * rng.normal(size=fine.position.shape))
+
+    def of(**options):
+        return learn(task(noisy, every=times), **options)
+
+    whole = of()
+    # with a step that was halved before it is interrupted
+    assert len(whole.history) > after + 1 and (whole.history[after].step < 1e-3) == (times > 1)
     path = tmp_path / "checkpoint.npz"
     seen = []
 
@@ -289,16 +296,17 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_ends(data, tmp_path, afte
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        learn(task(noisy), checkpoint=path, watch=interrupt)
-    resumed = learn(task(noisy), checkpoint=path)
+        of(checkpoint=path, watch=interrupt)
+    resumed = of(checkpoint=path)
+    assert resumed.task.step == whole.task.step
     for name in ("values", "uncertainty", "step_error", "status", "loss", "simulations", "gradients", "ended"):
         assert getattr(resumed, name) == getattr(whole, name)
     np.testing.assert_array_equal(resumed.correlation, whole.correlation)
-    for name in ("values", "loss", "simulations", "gradients"):
+    for name in ("values", "loss", "step", "simulations", "gradients"):
         np.testing.assert_array_equal(*([getattr(i, name) for i in r.history] for r in (resumed, whole)))
     assert sorted(file.name for file in tmp_path.iterdir()) == ["checkpoint.npz"]
     # Once more: it is there already.
-    again = learn(task(noisy), checkpoint=path)
+    again = of(checkpoint=path)
     assert (again.values, again.simulations) == (whole.values, whole.simulations)
 
 
@@ -347,10 +355,14 @@ def test_noise_counts_as_many_residuals_and_a_smooth_misfit_as_few():
     smooth = noise.copy()
     for k in range(1, 40):
         smooth[k] = 0.8 * smooth[k - 1] + 0.6 * noise[k]
-    # The variance of the mean of n numbers with a correlation of ρ^|i − j| is (1 + ρ)/(1 − ρ)/n, for many of them.
-    assert wl.independent(smooth) == pytest.approx(noise.size * 0.2 / 1.8, rel=0.05)
-    few = wl.residual_variance(smooth, 8, 1e-9)
-    assert few == pytest.approx((smooth**2).sum() / (noise.size * 0.2 / 1.8), rel=0.05)
+    # n numbers with a correlation of ρ^|i − j| have a λ of nearly (1 + ρ)/(1 − ρ). Along the other axes noise looks
+    # less like noise then, since samples are alike: that is the safe side, and not far on it.
+    some = noise.size * 0.2 / 1.8
+    assert 0.5 * some < wl.independent(smooth) < 1.15 * some
+    assert wl.residual_variance(smooth, 8, 1e-9) == pytest.approx((smooth**2).sum() / wl.independent(smooth), rel=1e-3)
+    # Neighbours that differ are no more independent than those that are alike.
+    alternating = smooth * (-1.0) ** np.arange(40)[:, None, None, None]
+    assert wl.independent(alternating) == pytest.approx(wl.independent(smooth))
     assert wl.residual_variance(1e-12 * smooth, 8, 1e-3) == 1e-6
 
 
@@ -358,8 +370,9 @@ def test_noise_counts_as_many_residuals_and_a_smooth_misfit_as_few():
 def test_the_steps_part_of_the_values_is_found_where_the_data_are_without_it(times):
     target = motion(frames=5 * times, step=2.5e-4 / times)
     problem = task(target, [dataclasses.replace(DENSITY, high=4e-3)], every=times)
-    result = learn(problem)
+    result = learn(problem, halvings=0)
     error = result.values["density[0]"] - value_of(SCENE, "density[0]")
+    assert result.task is problem
     if times == 1:
         assert result.step_share < 1e-6 and abs(error) < 1e-6
         assert abs(result.step_error["density[0]"]) < 1e-3 * abs(error)
@@ -368,11 +381,41 @@ def test_the_steps_part_of_the_values_is_found_where_the_data_are_without_it(tim
     assert result.step_share == pytest.approx(7 / 8, abs=0.05)
     # To first order; what is left is the product of two small errors.
     assert error > 0.1 * value_of(SCENE, "density[0]")
-    # What the step explains is no noise, so that it is all that the uncertainty consists of: the rest is 0.01 %.
-    assert result.uncertainty["density[0]"] == pytest.approx(result.step_error["density[0]"], rel=0.01)
     assert result.uncertainty["density[0]"] > result.step_error["density[0]"]
     assert result.step_error["density[0]"] == pytest.approx(error, rel=0.15)
     assert result.corrected["density[0]"] == pytest.approx(value_of(SCENE, "density[0]"), rel=0.02)
+
+
+def test_the_step_is_halved_to_that_of_the_data_and_no_further():
+    scene = wy.paper.hung_cloth(rows=5, columns=5)
+    parameters = [*PAPER[:2], *PAPER[4:7]]
+    for times in (1, 4):
+        fine = motion(scene, frames=5 * times, step=1e-3 / times)
+        problem = task(fine, parameters, scene=scene, every=times)
+        result = learn(problem)
+        assert result.task.step == pytest.approx(1e-3 / times)
+        steps = [i.step for i in result.history]
+        assert steps[0] == problem.step == pytest.approx(1e-3) and steps[-1] == result.task.step
+        assert np.diff([i.loss for i in result.history]).max() < 0.0
+        # 1 nm, at which learning ends
+        for name in problem.names:
+            assert result.values[name] == pytest.approx(value_of(scene, name), rel=1e-3)
+        if times == 4:
+            # A run counts as so many as it has steps.
+            before, after = (next(i for i in result.history if i.step == pytest.approx(h)) for h in (1e-3, 5e-4))
+            assert before.simulations == 1 and after.simulations > result.history[1].simulations
+            assert result.gradients == 4
+    once = learn(task(fine, parameters, scene=scene, every=4), halvings=1)
+    assert once.task.step == pytest.approx(5e-4)
+
+
+def test_noise_halves_no_step(data):
+    """Eq. 2's step has an error of many percent of these values, and the data have it: a shorter step would not do."""
+    rng = np.random.default_rng(1)
+    for _ in range(4):
+        noisy = dataclasses.replace(data, position=data.position + 1e-6 * rng.normal(size=data.position.shape))
+        problem = task(noisy)
+        assert learn(problem).task is problem
 
 
 def test_a_gradient_that_fails_does_not_lose_what_was_learned(data, monkeypatch):
@@ -619,6 +662,7 @@ def test_corrupt_frames_end_in_one_line_that_says_what_is_wrong(recording, tmp_p
         (["--integrator", "leapfrog"], "leapfrog"),
         (["--iterations", "-1"], "iterations = -1"),
         (["--resolution", "0"], "resolution = 0"),
+        (["--halvings", "-1"], "halvings = -1"),
         (["--parameters", "wool"], "'wool'"),
         (["--parameters", "wind_drag"], "--range wind_drag LOW HIGH"),
         (

@@ -63,6 +63,15 @@ def test_friction_of_the_ground_truth_is_coulombs(weave):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.parametrize("weave", wy.WEAVES)
+def test_the_model_reproduces_ground_truth_of_its_own_step_but_for_friction(weave):
+    fabric, frames = ground_truth.Fabric(weave, (1, 2)), 5
+    truth = fabric.truth(17, frames, "same", **ground_truth.TIGHT)
+    model = wy.Simulator(fabric.model(17), **ground_truth.TIGHT).run(frames)
+    # A friction too hard for Newton's iteration would split steps (1e6: of twill and satin), which makes some 1e-7 m.
+    assert 0.0 < np.sqrt(ground_truth.mean_square(truth.position, model.position)) < 1e-10
+
+
 def test_finer_ground_truth_is_nearer_to_the_converged_motion():
     frames = 4
     same, finer = (FABRIC.truth(4, frames, kind, integrator="linear") for kind in ground_truth.KINDS)

@@ -1,5 +1,6 @@
 """What can go wrong, as exceptions that say where, with which value, and what is allowed."""
 
+import functools
 from collections.abc import Iterable
 from typing import Any
 
@@ -28,6 +29,11 @@ class SimulationError(WarpYarnError, RuntimeError):
         super().__init__(message)
         self.step, self.node, self.term, self.trajectory = step, node, term, trajectory
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Exceptions are pickled as their positional arguments alone, and a process would hang that is sent this one.
+        numbers = {"step": self.step, "node": self.node, "term": self.term, "trajectory": self.trajectory}
+        return functools.partial(type(self), **numbers), self.args, self.__dict__
+
 
 class GradientError(WarpYarnError, RuntimeError):
     """A gradient that could not be computed.
@@ -40,6 +46,9 @@ class GradientError(WarpYarnError, RuntimeError):
     def __init__(self, message: str, *, step: int, term: str | None):
         super().__init__(message)
         self.step, self.term = step, term
+
+    def __reduce__(self) -> tuple[Any, ...]:  # as of a SimulationError
+        return functools.partial(type(self), step=self.step, term=self.term), self.args, self.__dict__
 
 
 def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:

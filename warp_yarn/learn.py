@@ -168,6 +168,7 @@ class Task:
         initial: the state that the model starts in.
         positions: what it is compared with [frames, nodes, 3] (m).
         step: its step [s].
+        cost: how many runs one of its runs counts as: 1, or so many times as its step was halved, in powers of 2.
         simulations: runs made so far, those that gradients begin with among them.
         gradients: backward runs made so far.
     """
@@ -191,17 +192,27 @@ class Task:
         )
         self._check_parameters()
         chosen = self._chosen_frames(target, frames, first, every)
-        count = len(chosen) - 1
         self.initial = target[int(chosen[0])]
         self.positions = target.position[chosen[1:]].copy()
         self.frame_time = target.step * every
-        self.steps_per_frame = 1 if step is None else self._steps_per_frame(number("step", step, above=0.0))
-        self.step = self.frame_time / self.steps_per_frame
-        after = np.arange(1, count + 1) * self.steps_per_frame
-        self.rollout = Rollout(scene, int(after[-1]), frames=after, step=self.step, **options)
-        self.rollout.simulator.state = self.initial  # to have it checked
         self._state = {name: torch.as_tensor(getattr(self.initial, name)) for name in FIELDS}
+        self._prepare(1 if step is None else self._steps_per_frame(number("step", step, above=0.0)))
+        self.cost = 1
         self.simulations = self.gradients = 0
+
+    def _prepare(self, steps_per_frame: int) -> None:
+        """Settles the step, and with it the rollout."""
+        self.steps_per_frame, self.step = steps_per_frame, self.frame_time / steps_per_frame
+        after = np.arange(1, len(self.positions) + 1) * steps_per_frame
+        self.rollout = Rollout(self.scene, int(after[-1]), frames=after, step=self.step, **self.options)
+        self.rollout.simulator.state = self.initial  # to have it checked
+
+    def halved(self) -> Task:
+        """The same task for a model of half the step, with the runs that this one has made."""
+        result = copy.copy(self)
+        result._prepare(2 * self.steps_per_frame)
+        result.cost = 2 * self.cost
+        return result
 
     def _check_parameters(self) -> None:
         if not self.names:
@@ -264,7 +275,7 @@ class Task:
 
     def _run(self, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
         """The residuals of a run."""
-        self.simulations += 1
+        self.simulations += self.cost
         offset = self.rollout(**inputs).position.double().cpu() - torch.as_tensor(self.positions)
         return offset / np.sqrt(len(self.positions) * self.scene.cloth.nodes)
 
@@ -291,7 +302,7 @@ class Task:
         """
         inputs = self._inputs(values, differentiated=True)
         loss = self._run(inputs).square().sum()
-        self.gradients += 1
+        self.gradients += self.cost
         loss.backward()
         parts = [(inputs[base].grad, k) for base, k in map(split, self.names)]
         return float(loss.detach()), np.array([float(part if k is None else part[k]) for part, k in parts])
@@ -355,6 +366,12 @@ BAR = "{desc} {n_fmt} {elapsed}{postfix}"
 SHORTEST = 1e-7
 """A step that is not worth a run [ranges]."""
 
+KNOWN = 0.015
+"""Standard deviation of a value for whose sake no shorter step is tried [ranges]: at most 3 % of the paper's values."""
+
+LESS = 0.9
+"""What must be left of a standard deviation, as far as can be foreseen, for a shorter step to be worth its runs."""
+
 DETERMINED = 0.5 / np.sqrt(12.0)
 """Standard deviation below which the data determine a parameter [ranges]: half of what the range alone says."""
 
@@ -366,12 +383,14 @@ class Iteration:
     Args:
         values: of the parameters, in their units [parameters].
         loss: at them [m²].
-        simulations, gradients: runs so far.
+        step: of the model [s].
+        simulations, gradients: runs so far, as of a Task.
         seconds: wall time so far; compiling, where kernels changed, is part of it.
     """
 
     values: np.ndarray
     loss: float
+    step: float
     simulations: int
     gradients: int
     seconds: float
@@ -382,6 +401,7 @@ class Result:
     """What was learned.
 
     Args:
+        task: with the model's step that the values were learned with; the task's own, or one so many times halved.
         parameters: what was to be learned.
         values: by name.
         uncertainty: standard deviations, by name: what the data leave open (``uncertainties``) and the step's error.
@@ -396,10 +416,11 @@ class Result:
         loss: at the values [m²].
         gradient: of the loss, exact, with respect to (value − low)/(high − low) [parameters] (m²); NaN where it fails.
         history: every iteration.
-        simulations, gradients, seconds: what it took, as of an Iteration; one run with half the step counts as two.
+        simulations, gradients, seconds: what it took, as of an Iteration.
         ended: why it ended.
     """
 
+    task: Task
     parameters: tuple[Parameter, ...]
     values: dict[str, float]
     uncertainty: dict[str, float]
@@ -426,6 +447,7 @@ def learn(
     *,
     iterations: int = 100,
     resolution: float = 1e-9,
+    halvings: int = 3,
     checkpoint: str | os.PathLike | None = None,
     progress: bool = False,
     watch: Callable[[Iteration], None] = lambda iteration: None,
@@ -439,6 +461,9 @@ def learn(
         iterations: at most.
         resolution: how far the data's positions may be off at least, root mean square [m], above 0. Learning ends where
             the model is as near as that, and a parameter that moves positions by less is left where it is.
+        halvings: how many times the model's step may be halved. It is where it leaves a value less sure than KNOWN, as
+            far as its error stands in the residuals (``Result.step_share``), and where a model of half the step, with
+            values without the step's part, is nearer to the data. Those of the model's own step and method are not.
         checkpoint: a file, ending in .npz, that is written after every iteration. Where it is there already, learning
             goes on from it, and ends where it would have ended without the interruption.
         progress: show a bar with the loss and the values, on a terminal.
@@ -449,7 +474,7 @@ def learn(
         SimulationError: the model cannot be simulated with the start values. A later step to such values is shortened.
     """
     whole("iterations", iterations, least=0)
-    search = _Search(task, number("resolution", resolution, above=0.0))
+    search = _Search(task, number("resolution", resolution, above=0.0), whole("halvings", halvings, least=0))
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.suffix != ".npz":
         raise InputError(f"checkpoint = {str(checkpoint)!r}, must end in .npz")
@@ -476,11 +501,31 @@ def learn(
     return search.result(ended)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Answer:
+    """What the data leave open where the search is, in ranges.
+
+    Args:
+        covariance: of the values, as far as the residuals tell [p, p].
+        deviation: standard deviations, the step's error included [p].
+        without_step: what they would be without the part of the residuals that the step explains [p].
+        step_error: the part of the values that is due to the step [p].
+        share: of the step's error that the data are without.
+    """
+
+    covariance: np.ndarray
+    deviation: np.ndarray
+    without_step: np.ndarray
+    step_error: np.ndarray
+    share: float
+
+
 class _Search:
     """Where learning is: y = (value − low)/(high − low), the residuals there, and the Jacobian as far as known."""
 
-    def __init__(self, task: Task, resolution: float):
+    def __init__(self, task: Task, resolution: float, halvings: int):
         self.task, self.resolution = task, resolution
+        self.most_steps = task.steps_per_frame * 2**halvings
         self.y = (task.start - task.low) / (task.high - task.low)
         self.residuals = np.zeros(0)
         self.jacobian: np.ndarray | None = None
@@ -507,7 +552,8 @@ class _Search:
 
     def _note(self) -> None:
         seconds = time.perf_counter() - self.began
-        self.history.append(Iteration(self.values, self.loss, self.task.simulations, self.task.gradients, seconds))
+        task = self.task
+        self.history.append(Iteration(self.values, self.loss, task.step, task.simulations, task.gradients, seconds))
 
     def describe(self) -> str:
         values: dict[str, str] = {}
@@ -517,14 +563,17 @@ class _Search:
         return ", ".join((f"loss {self.loss:.1e}", *values.values()))
 
     def advance(self) -> str | None:
-        """An iteration: a step that lowers the loss. Returns why there is none, where there is none."""
+        """An iteration: a step that lowers the loss, or a shorter step of the model. Returns why there is none."""
         while True:
             if self.loss <= self.resolution**2:
                 return "as near to the data as their resolution"
             if self.jacobian is None:
                 self._differentiate()
             _, gain = self._step(0.0)
-            if gain > ENOUGH**2 * residual_variance(self._field(self.residuals), len(self.y), self.resolution):
+            variance = residual_variance(self._field(self.residuals), len(self.y), self.resolution)
+            if gain <= variance and self._halve():  # as near as this step deserves, the Jacobian being old or not
+                return None
+            if gain > ENOUGH**2 * variance:
                 if self._try():
                     return None
                 if self.fresh:
@@ -584,6 +633,25 @@ class _Search:
         self._note()
         return True
 
+    def _halve(self) -> bool:
+        """Goes on with half the model's step, from values without its error, where that is worth it and nearer."""
+        if self.task.steps_per_frame == self.most_steps:
+            return False
+        now = self._answer()
+        if not np.any((now.deviation > KNOWN) & (now.without_step < LESS * now.deviation)):
+            return False
+        finer, y = self.task.halved(), np.clip(self.y - now.step_error, 0.0, 1.0)
+        try:
+            residuals = finer.residuals(self._physical(y))
+        except SimulationError:
+            residuals = None
+        self.task.simulations = finer.simulations
+        if residuals is None or float(residuals @ residuals) >= self.loss:  # what looked like the step's error was none
+            return False
+        self.task, self.y, self.residuals, self.fresh = finer, y, residuals, False
+        self._note()
+        return True
+
     # -- files -------------------------------------------------------------------------------------------------------
 
     def _identity(self) -> dict[str, np.ndarray]:
@@ -599,7 +667,13 @@ class _Search:
     def save(self, path: Path) -> None:
         history = {field: np.array([getattr(i, field) for i in self.history]) for field in _OF_ITERATIONS}
         known = np.zeros((0, len(self.y))) if self.jacobian is None else self.jacobian
-        state = {"y": self.y, "damping": self.damping, "scale": self.scale, "jacobian": known}
+        state = {
+            "y": self.y,
+            "steps_per_frame": self.task.steps_per_frame,
+            "damping": self.damping,
+            "scale": self.scale,
+            "jacobian": known,
+        }
         with whole_file(path) as temporary, open(temporary, "wb") as file:
             np.savez(file, **self._identity(), **state, **{f"history_{name}": rows for name, rows in history.items()})
 
@@ -609,6 +683,7 @@ class _Search:
             with np.load(path) as data:
                 same = all(np.array_equal(data[name], value) for name, value in self._identity().items())
                 y, damping, scale, known = (data[name] for name in ("y", "damping", "scale", "jacobian"))
+                steps_per_frame = int(data["steps_per_frame"])
                 rows = zip(*(data[f"history_{name}"].tolist() for name in _OF_ITERATIONS), strict=True)
                 history = [Iteration(np.array(values), *rest) for values, *rest in rows]
                 last = history[-1]
@@ -618,6 +693,8 @@ class _Search:
             raise InputError(f"{path}: of other parameters, ranges, starts or resolution; remove it to begin anew")
         self.y, self.damping, self.scale, self.history = y, float(damping), scale, history
         self.jacobian = known if len(known) else None
+        while self.task.steps_per_frame < steps_per_frame:
+            self.task = self.task.halved()
         self.residuals = self.task.residuals(self.values)
         # 1e-6: another processor may round otherwise
         if not np.isclose(self.loss, last.loss, rtol=1e-6, atol=0.0):
@@ -630,16 +707,27 @@ class _Search:
 
     # -- the answer --------------------------------------------------------------------------------------------------
 
+    def _answer(self) -> _Answer:
+        """What the data leave open here."""
+        shift, rest, share = step_errors(self.jacobian, self.residuals, self._missed_by_the_step(), self.resolution)
+
+        def covariance(residuals: np.ndarray) -> np.ndarray:
+            return uncertainties(self.jacobian, residual_variance(self._field(residuals), len(self.y), self.resolution))
+
+        # Of all that is left, not of what the step does not explain: where the step is too long for its error to be one
+        # of first order, that would be too sure (stretch[1] of 5 × 5: 11 % off with 0.6 %).
+        own = covariance(self.residuals)
+        of_data = np.sqrt(np.diag(own))
+        step_error = np.where(of_data < DETERMINED, share * shift, 0.0)
+        without_step = np.sqrt(np.diag(covariance(self.residuals + share * rest)))
+        return _Answer(own, np.hypot(of_data, step_error), without_step, step_error, share)
+
     def result(self, ended: str) -> Result:
         task, width = self.task, self.task.high - self.task.low
         if not self.fresh:
             self._differentiate()
-        shift, rest, share = step_errors(self.jacobian, self.residuals, self._missed_by_the_step(), self.resolution)
-        # what neither the parameters nor the step explain
-        variance = residual_variance(self._field(self.residuals + share * rest), len(self.y), self.resolution)
-        covariance = uncertainties(self.jacobian, variance)
-        deviation = np.sqrt(np.diag(covariance))
-        step_error = np.where(deviation < DETERMINED, share * shift, 0.0)
+        answer = self._answer()
+        of_data = np.sqrt(np.diag(answer.covariance))
         try:
             _, gradient = task.loss_and_gradient(self.values)
         except GradientError:  # of steps that could only be made in parts
@@ -649,13 +737,14 @@ class _Search:
             return dict(zip(task.names, values.tolist(), strict=True))
 
         return Result(
+            task=task,
             parameters=task.parameters,
             values=by_name(self.values),
-            uncertainty=by_name(np.hypot(deviation, step_error) * width),
-            step_error=by_name(step_error * width),
-            step_share=share,
-            status={name: _status(*of) for name, *of in zip(task.names, self.y, deviation, strict=True)},
-            correlation=covariance / np.outer(deviation, deviation),
+            uncertainty=by_name(answer.deviation * width),
+            step_error=by_name(answer.step_error * width),
+            step_share=answer.share,
+            status={name: _status(*of) for name, *of in zip(task.names, self.y, of_data, strict=True)},
+            correlation=answer.covariance / np.outer(of_data, of_data),
             loss=self.loss,
             gradient=gradient * width,
             history=self.history,
@@ -673,7 +762,7 @@ class _Search:
     def _missed_by_the_step(self) -> np.ndarray:
         """Estimate of what the residuals at these values would gain if the step went to 0 [residuals]; 0 if unknown."""
         task = self.task
-        task.simulations += 2
+        task.simulations += 2 * task.cost
         try:
             finer = task.trajectory(self.values, refine=2).position[1:]
         except SimulationError:
@@ -705,12 +794,13 @@ def uncertainties(jacobian: np.ndarray, variance: float) -> np.ndarray:
 
 
 def residual_variance(residuals: np.ndarray, parameters: int, resolution: float) -> float:
-    """s² = max(|r|²/max(n − p, 1), resolution²) of residuals r [frames, rows, columns, 3] (m), their number n [m²].
+    """s² = max(|r|²/(n' (1 − p/n)), resolution²) of n residuals r [frames, rows, columns, 3] (m), p parameters [m²].
 
-    n counts independent residuals (``independent``): data that differ from the model by noise have as many as numbers,
-    data that differ by what the model cannot do have few.
+    n' counts independent residuals (``independent``): data that differ from the model by noise have as many as numbers,
+    data that differ by what the model cannot do have few. Of what they differ by, the parameters have taken p/n away.
     """
-    return max(float((residuals**2).sum()) / max(independent(residuals) - parameters, 1.0), resolution**2)
+    left = max(1.0 - parameters / residuals.size, 1.0 / residuals.size)
+    return max(float((residuals**2).sum()) / (independent(residuals) * left), resolution**2)
 
 
 def step_errors(
@@ -739,18 +829,21 @@ def step_errors(
 
 
 def independent(residuals: np.ndarray) -> float:
-    """How many of these residuals [frames, rows, columns, 3] are independent.
+    """How many of these residuals [frames, rows, columns, 3] are independent, at the least.
 
-    Along an axis of n, with a correlation ρ of neighbours, n (1 − ρ)/(1 + ρ), and 1 at the least: their mean is as sure
-    as that of n whose correlation falls by ρ from each to the next. A negative ρ counts as 0.
+    What is learned is a weighted sum of residuals, and the variance of one whose weights have the norm 1 is at most the
+    largest eigenvalue λ of their correlation, which is 1 where they are independent. So n along an axis count as n/λ,
+    with the correlation along it as the other axes show it: as 1 where all are alike, and as 1 or 2 where they
+    oscillate, though neighbours differ then. In N samples of noise λ is up to some (1 + √(n/N))² (Marchenko and
+    Pastur): what is below counts as 1. N counts samples that may be alike too, which errs to the safe side.
     """
     result = float(residuals.shape[3])
-    square = float((residuals**2).mean())
     for axis in range(3):
         n = residuals.shape[axis]
-        correlation = 0.0
-        if n > 1 and square > 0.0:
-            here, next = (np.take(residuals, range(k, n - 1 + k), axis) for k in (0, 1))
-            correlation = np.clip((here * next).mean() / square, 0.0, 1.0)
-        result *= max(1.0, n * (1.0 - correlation) / (1.0 + correlation))
+        along = np.moveaxis(residuals, axis, 0).reshape(n, -1)
+        covariance = along @ along.T
+        mean = np.trace(covariance) / n
+        largest = np.linalg.eigvalsh(covariance)[-1]
+        of_noise = (1.0 + np.sqrt(n / along.shape[1])) ** 2
+        result *= n * mean / largest if largest > of_noise * mean else n
     return result
