@@ -4,7 +4,8 @@
 
 U is the upper blocks of A as they are, E block-diagonal: only the diagonal blocks are corrected. Along one yarn that is
 the exact factorization, and warp and weft stretch along different directions, so little is dropped: at 17 × 17 it needs
-12 iterations where Jacobi needs 170, and hardly more on larger cloths.
+10 iterations to 1e-6 where the diagonal of A needs 125, its diagonal blocks 86 (so there is no block Jacobi), and on
+larger cloths 9, 151 and 107.
 
 The layout of the matrix is told in ``solver.py``.
 """
