@@ -13,6 +13,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .access import functions as access
+from .indexing import index
 from .step import NOT_FINITE, ORDER_LOST, STALLED
 from .variant import Variant
 
@@ -45,6 +47,7 @@ COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    at = access(variant).at
     module = variant.module("stage")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -64,7 +67,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_increment: wp.array(dtype=scalar),
     ):
         """q = q₀ + η w, q̇ = w, and v₀ − w, whose momentum the residual has."""
-        i = wp.tid()
+        i = index(wp.tid())
         w = solution[i]
         position[i] = base_position[i] + w * stage_size[0]
         velocity[i] = w
@@ -91,10 +94,10 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
         has them much nearer to each other than the first stage left them."""
-        e = wp.tid()
-        direction = yarn_direction[segment_yarn[e]]
-        sa = 2 * segment_nodes[e][0] + direction
-        sb = 2 * segment_nodes[e][1] + direction
+        e = index(wp.tid())
+        direction = yarn_direction[index(segment_yarn[e])]
+        sa = index(2 * segment_nodes[e][0] + direction)
+        sb = index(2 * segment_nodes[e][1] + direction)
         rest = base_euler[sb] - base_euler[sa]
         if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
             crosses[0] = 1
@@ -113,7 +116,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_solution: wp.array(dtype=scalar),
     ):
         """w + α δ."""
-        i = wp.tid()
+        i = index(wp.tid())
         solution[i] = solution_before[i] + direction[i] * step_length[0]
         if wp.static(sliding):
             for d in range(2):
@@ -133,10 +136,10 @@ def define(variant: Variant) -> SimpleNamespace:
         """Begins a line search along δ: a full step first, and r·δ, how fast r falls along δ."""
         total = scalar(0.0)
         for i in range(nodes):
-            total += wp.dot(rhs[i], direction[i])
+            total += wp.dot(at(rhs, i), at(direction, i))
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    total += euler_rhs[s] * euler_direction[s]
+                    total += at(euler_rhs, s) * at(euler_direction, s)
         slope[0] = total
         step_length[0] = scalar(1.0)
 
@@ -174,33 +177,36 @@ def define(variant: Variant) -> SimpleNamespace:
 
         ‖r‖ is in the norm of A's inverse diagonal and ‖w‖ in that of its diagonal: both are √(energy).
         """
+        one = scalar(1.0)
         turned = scalar(0.0)
         of_rhs = scalar(0.0)
         of_solution = scalar(0.0)
         of_rounding = scalar(0.0)
-        worst = int(-1)
         for i in range(nodes):
-            for k in range(3):
-                inverse = inverse_x[i][k]
-                if inverse > scalar(0.0):
-                    of_rounding += position[i][k] * position[i][k] / inverse
-                    of_rhs += inverse * rhs[i][k] * rhs[i][k]
-                    of_solution += solution[i][k] * solution[i][k] / inverse
-                    turned += rhs[i][k] * direction[i][k]
-                elif is_free[i] != 0:
-                    # a matrix without bounds: nothing here means anything
-                    of_rhs += scalar(wp.static(float("inf")))
-                    worst = i
-                if not wp.isfinite(rhs[i][k]):
-                    worst = i
+            inverse = at(inverse_x, i)
+            r = at(rhs, i)
+            if inverse[0] > scalar(0.0) and inverse[1] > scalar(0.0) and inverse[2] > scalar(0.0):
+                w = at(solution, i)
+                x = at(position, i)
+                stiffness = vec3(one / inverse[0], one / inverse[1], one / inverse[2])
+                of_rhs += wp.dot(wp.cw_mul(inverse, r), r)
+                of_solution += wp.dot(wp.cw_mul(stiffness, w), w)
+                of_rounding += wp.dot(wp.cw_mul(stiffness, x), x)
+                turned += wp.dot(r, at(direction, i))
+            elif is_free[i] != 0:
+                # a matrix without bounds: nothing here means anything
+                of_rhs += scalar(wp.static(float("inf")))
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    inverse = inverse_s[s]
-                    if inverse > scalar(0.0):
-                        of_rounding += euler[s] * euler[s] / inverse
-                        of_rhs += inverse * euler_rhs[s] * euler_rhs[s]
-                        of_solution += euler_solution[s] * euler_solution[s] / inverse
-                        turned += euler_rhs[s] * euler_direction[s]
+                    inverse_along = at(inverse_s, s)
+                    if inverse_along > scalar(0.0):
+                        stiffness_along = one / inverse_along
+                        r_s = at(euler_rhs, s)
+                        w_s = at(euler_solution, s)
+                        of_rhs += inverse_along * r_s * r_s
+                        of_solution += stiffness_along * w_s * w_s
+                        of_rounding += stiffness_along * at(euler, s) * at(euler, s)
+                        turned += r_s * at(euler_direction, s)
         now = wp.sqrt(of_rhs)
         scale = wp.sqrt(of_solution)
         # velocities that positions are too coarse to tell from 0
@@ -241,7 +247,10 @@ def define(variant: Variant) -> SimpleNamespace:
         elif not wp.isfinite(before) or not wp.isfinite(scale):
             continues[0] = 0
             status[0] = wp.static(NOT_FINITE)
-            status[1] = worst
+            status[1] = -1
+            for i in range(nodes):
+                if is_free[i] != 0 and not (wp.isfinite(rhs[i]) and wp.min(inverse_x[i]) > scalar(0.0)):
+                    status[1] = i
         elif stalled and continues[0] != 0:
             continues[0] = 0
             # what rounding leaves cannot be taken away
@@ -257,11 +266,11 @@ def define(variant: Variant) -> SimpleNamespace:
         euler: wp.array(dtype=scalar),
         shortest: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        direction = yarn_direction[segment_yarn[e]]
-        wp.atomic_min(
-            shortest, 0, euler[2 * segment_nodes[e][1] + direction] - euler[2 * segment_nodes[e][0] + direction]
-        )
+        e = index(wp.tid())
+        direction = yarn_direction[index(segment_yarn[e])]
+        sa = index(2 * segment_nodes[e][0] + direction)
+        sb = index(2 * segment_nodes[e][1] + direction)
+        wp.atomic_min(shortest, 0, euler[sb] - euler[sa])
 
     @wp.kernel(module=module, enable_backward=False)
     def keep_order(
@@ -274,10 +283,10 @@ def define(variant: Variant) -> SimpleNamespace:
         step_length: wp.array(dtype=scalar),
     ):
         """Shortens the step along δ so far that it leaves something of every Δs."""
-        e = wp.tid()
-        direction = yarn_direction[segment_yarn[e]]
-        sa = 2 * segment_nodes[e][0] + direction
-        sb = 2 * segment_nodes[e][1] + direction
+        e = index(wp.tid())
+        direction = yarn_direction[index(segment_yarn[e])]
+        sa = index(2 * segment_nodes[e][0] + direction)
+        sb = index(2 * segment_nodes[e][1] + direction)
         rest = euler[sb] - euler[sa]
         loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
         allowed = rest * scalar(wp.static(1.0 - NEAREST))
@@ -293,8 +302,10 @@ def define(variant: Variant) -> SimpleNamespace:
         refreshes: wp.array(dtype=int),
     ):
         """Asks for a new matrix where a yarn turns in the step."""
-        e = wp.tid()
-        moved = wp.length(solution[segment_nodes[e][1]] - solution[segment_nodes[e][0]]) * step_size[0]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        moved = wp.length(solution[b] - solution[a]) * step_size[0]
         if moved > scalar(wp.static(TURNING)) * spacing[0]:
             refreshes[0] = 1
 
@@ -313,7 +324,7 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """q₀ + t w and v₀ + k (w − v₀): from a stage's base to the next stage's, which starts from the same gain of
         velocity if asked for one. Sliding rates start from those of the stage before: they have next to no inertia."""
-        i = wp.tid()
+        i = index(wp.tid())
         w = solution[i]
         gain = w - base_velocity[i]
         v0 = base_velocity[i] + gain * carried_rate[0]
@@ -346,7 +357,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_first_solution: wp.array(dtype=scalar),
     ):
         """w of the first stage, from q⁺ = q₀ + t w₁ + η w₂; what is held has one velocity in both."""
-        i = wp.tid()
+        i = index(wp.tid())
         k = (counters[0] + 1) * nodes + i
         w = solution[i]
         first_solution[i] = w
@@ -367,7 +378,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_solution: wp.array(dtype=scalar),
     ):
         """w of a stage that was carried to the step's end, from q̇⁺ = q̇ + k (w − q̇)."""
-        i = wp.tid()
+        i = index(wp.tid())
         solution[i] = velocity[i] + (solution[i] - velocity[i]) / carried_rate[0]
         if wp.static(sliding):
             for s in range(2 * i, 2 * i + 2):
@@ -388,7 +399,7 @@ def define(variant: Variant) -> SimpleNamespace:
 
         The end of a step, q⁺ = q₀ + η w and q̇⁺ = w, is t = η and k = 1.
         """
-        i = wp.tid()
+        i = index(wp.tid())
         v = base_velocity_grad[i]
         stage_adjoint[i] = base_position_grad[i] * time[0] + v * rate[0]
         base_velocity_grad[i] = v * (scalar(1.0) - rate[0])
@@ -415,7 +426,7 @@ def define(variant: Variant) -> SimpleNamespace:
         status: wp.array(dtype=int),
     ):
         """ρ = w̄ + (∂r/∂w)ᵀ λ, from what reverse mode has gathered."""
-        i = wp.tid()
+        i = index(wp.tid())
         r = stage_adjoint[i] + position_grad[i] * stage_size[0] + velocity_grad[i] - increment_grad[i]
         finite = wp.isfinite(r)
         seed[i] = r
@@ -442,7 +453,7 @@ def define(variant: Variant) -> SimpleNamespace:
         base_euler_velocity_grad: wp.array(dtype=scalar),
     ):
         """The adjoints of q₀ and v₀ gain what came through q = q₀ + η w and v₀ − w."""
-        i = wp.tid()
+        i = index(wp.tid())
         base_position_grad[i] = base_position_grad[i] + position_grad[i]
         base_velocity_grad[i] = base_velocity_grad[i] + increment_grad[i]
         for d in range(2):
