@@ -208,6 +208,21 @@ def test_crossings_never_change_their_order(method: str, terms: list[str]) -> No
     assert np.diff(euler[..., 0], axis=2).min() > 0.0 and np.diff(euler[..., 1], axis=1).min() > 0.0
 
 
+def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
+    """As the square of steps that are shorter than four of the times in which a stretch wave passes a segment."""
+    soft = dataclasses.replace(wy.paper.YARNS[1], stretch=1.0e5)
+    fabric = wy.Cloth(wy.Weave.plain(rows=4, columns=4), yarns=[wy.paper.YARNS[1], soft])
+    wave = fabric.spacing / np.sqrt(1.0e5 * np.pi * fabric.radius**2 / soft.density)
+
+    def tolerance(step: float, **options: object) -> float:
+        return wy.Simulator(wy.Scene(fabric), step=step, **options).model.newton_tolerance
+
+    assert tolerance(1e-2) == tolerance(4.001 * wave) == 3e-4
+    assert tolerance(wave) == pytest.approx(3e-4 / 16, rel=1e-12)
+    assert tolerance(1e-9) == tolerance(wave, differentiable=True) == 1e-8
+    assert tolerance(wave, precision="single") == 3e-4
+
+
 def test_unknown_method_is_refused() -> None:
     with pytest.raises(
         wy.InputError,

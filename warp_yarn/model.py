@@ -36,8 +36,10 @@ PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
 NEWTON_TOLERANCE = 3e-4
-"""Adds less than a tenth to the error of the second-order methods at steps of 1/4 to 2 ms of the paper's cloth
-(``benchmarks/work_precision.py``)."""
+RESOLVED = 4.0
+"""Of steps that do not resolve the yarns' vibrations: a stretch wave runs from a crossing to the next in less than the
+``RESOLVED``-th part of a step. A tenth at most is then added to the error of the second-order methods. The error of
+shorter steps falls with their square, and so does the tolerance in double precision."""
 EXACT = 1e-8
 """Both tolerances of differentiable runs in double precision: gradients are right to no more digits than these."""
 
@@ -79,7 +81,7 @@ class Model:
         exact = differentiable and precision == "double"
         default = EXACT if exact else TOLERANCES[precision]
         self.tolerance = number("tolerance", default if tolerance is None else tolerance, above=0.0)
-        default = EXACT if exact else NEWTON_TOLERANCE
+        default = EXACT if exact else self._newton_tolerance()
         self.newton_tolerance = number(
             "newton_tolerance", default if newton_tolerance is None else newton_tolerance, above=0.0
         )
@@ -98,6 +100,17 @@ class Model:
         self.arrays["tolerance"] = self.arrays.numbers(self.tolerance)
         self._form_team(whole("threads", threads, least=1))
         self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
+
+    def _newton_tolerance(self) -> float:
+        """The default, after the step's error."""
+        cloth = self.scene.cloth
+        speeds = [
+            np.sqrt(yarn.stretch * np.pi * cloth.radius**2 / yarn.density) for yarn in cloth.yarns if yarn.stretch
+        ]
+        if self.precision == "single" or not speeds:
+            return NEWTON_TOLERANCE
+        resolved = RESOLVED * cloth.spacing / min(speeds)
+        return max(EXACT, NEWTON_TOLERANCE * min(1.0, self.step_size / resolved) ** 2)
 
     def _form_team(self, threads: int) -> None:
         """Strips of the cloth for so many processor cores (``kernels/team.py``)."""
