@@ -36,8 +36,9 @@ class Timing:
         return {f"{name} [ms]": 1e3 * self.median, f"{name} IQR [ms]": 1e3 * (self.upper - self.lower)}
 
 
-def measure(functions: Sequence[Callable[[], Any]], repeats: int) -> list[Timing]:
-    """Times functions in turn, so that what else the machine does falls on all alike; a first turn is not counted.
+def turns(functions: Sequence[Callable[[], Any]], repeats: int) -> list[list[float]]:
+    """Wall times of every function [s], the k-th of one beside the k-th of another, so that what else the machine does
+    falls on all alike; a first turn is not counted.
 
     A function returns how long it took [s], or None: then all of it counts.
     """
@@ -49,7 +50,12 @@ def measure(functions: Sequence[Callable[[], Any]], repeats: int) -> list[Timing
             elapsed = time.perf_counter() - start
             if turn > 0:
                 times.append(elapsed if own is None else own)
-    return [Timing.of(times) for times in seconds]
+    return seconds
+
+
+def measure(functions: Sequence[Callable[[], Any]], repeats: int) -> list[Timing]:
+    """Times functions in turns."""
+    return [Timing.of(times) for times in turns(functions, repeats)]
 
 
 def one_core() -> None:

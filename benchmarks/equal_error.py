@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
-from common import RESULTS, Timing, environment, one_core, print_table, write_csv
+from common import RESULTS, Timing, environment, one_core, print_table, turns, write_csv
 from motions import MOTIONS, Motion
 from work_precision import EQ_2, TARGETS, Reference, end, reference
 
@@ -63,21 +63,23 @@ def steps_to(
     return found
 
 
-def side_by_side(motion: Motion, size: int, steps: dict[str, int], repeats: int) -> dict[str, list[float]]:
+def side_by_side(motion: Motion, size: int, steps: dict[str, int], repeats: int) -> dict[str, np.ndarray]:
     """Wall times per simulated second of every method's runs, the k-th of one beside the k-th of another."""
-    simulators = {
-        name: motion.simulator(size, step=motion.duration / count, integrator=name) for name, count in steps.items()
-    }
-    beginnings = {name: simulator.state for name, simulator in simulators.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in steps}
-    for turn in range(repeats + 1):
-        for name, simulator in simulators.items():
-            simulator.state, simulator.steps_done = beginnings[name], 0
+
+    def timed(method: str, count: int) -> Callable[[], float]:
+        simulator = motion.simulator(size, step=motion.duration / count, integrator=method)
+        beginning = simulator.state
+
+        def run() -> float:
+            simulator.state, simulator.steps_done = beginning, 0
             begin = time.perf_counter()
-            end(simulator, steps[name])
-            if turn:  # the first one captures
-                seconds[name].append((time.perf_counter() - begin) / motion.duration)
-    return seconds
+            end(simulator, count)
+            return (time.perf_counter() - begin) / motion.duration
+
+        return run
+
+    seconds = turns([timed(method, count) for method, count in steps.items()], repeats)
+    return {method: np.array(times) for method, times in zip(steps, seconds, strict=True)}
 
 
 def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, Any]]:
@@ -97,7 +99,7 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
             row["step [ms]"] = 1e3 * motion.duration / steps[method]
             row |= {"wall [s per simulated s]": timing.median, "wall IQR": timing.upper - timing.lower}
             if EQ_2 in steps:
-                ratio = Timing.of(np.array(seconds[method]) / np.array(seconds[EQ_2]))
+                ratio = Timing.of(seconds[method] / seconds[EQ_2])
                 row |= {"of eq. 2's": ratio.median, "of IQR": ratio.upper - ratio.lower}
             else:
                 row |= {"of eq. 2's": "", "of IQR": ""}

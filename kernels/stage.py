@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .access import functions as access
-from .indexing import index
+from .indexing import coordinates, index
 from .step import NOT_FINITE, ORDER_LOST, STALLED
 from .variant import Variant
 
@@ -95,9 +95,7 @@ def define(variant: Variant) -> SimpleNamespace:
         """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
         has them much nearer to each other than the first stage left them."""
         e = index(wp.tid())
-        direction = yarn_direction[index(segment_yarn[e])]
-        sa = index(2 * segment_nodes[e][0] + direction)
-        sb = index(2 * segment_nodes[e][1] + direction)
+        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
         rest = base_euler[sb] - base_euler[sa]
         if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
             crosses[0] = 1
@@ -267,9 +265,7 @@ def define(variant: Variant) -> SimpleNamespace:
         shortest: wp.array(dtype=scalar),
     ):
         e = index(wp.tid())
-        direction = yarn_direction[index(segment_yarn[e])]
-        sa = index(2 * segment_nodes[e][0] + direction)
-        sb = index(2 * segment_nodes[e][1] + direction)
+        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
         wp.atomic_min(shortest, 0, euler[sb] - euler[sa])
 
     @wp.kernel(module=module, enable_backward=False)
@@ -284,9 +280,7 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """Shortens the step along δ so far that it leaves something of every Δs."""
         e = index(wp.tid())
-        direction = yarn_direction[index(segment_yarn[e])]
-        sa = index(2 * segment_nodes[e][0] + direction)
-        sb = index(2 * segment_nodes[e][1] + direction)
+        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
         rest = euler[sb] - euler[sa]
         loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
         allowed = rest * scalar(wp.static(1.0 - NEAREST))

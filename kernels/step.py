@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .indexing import index
+from .indexing import coordinates, index
 from .variant import Variant
 
 NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED = 1, 2, 3, 4
@@ -130,12 +130,10 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """Δs > 0: crossings keep their order along a yarn."""
         e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        if euler[2 * segment_nodes[e][1] + direction] <= euler[2 * a + direction]:
+        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        if euler[sb] <= euler[sa]:
             if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
-                status[1] = a
+                status[1] = segment_nodes[e][0]
 
     @wp.kernel(module=module, enable_backward=False)
     def copy_vectors(source: wp.array(dtype=vec3), target: wp.array(dtype=vec3)):

@@ -67,11 +67,6 @@ def cloth(weave: str = "plain", size: int = 7, **options: Any) -> wy.Cloth:
     return wy.Cloth(draft, **{**yarns, "pose": "flat", "friction_damping": DAMPING, **options})
 
 
-def stiffness(cloth: wy.Cloth) -> float:
-    """kₛ of its yarns [N]."""
-    return cloth.yarns[0].stretch * np.pi * cloth.radius**2
-
-
 def pull(
     cloth: wy.Cloth, *, speed: float, distance: float, step: float, row: int | None = None, **options: Any
 ) -> Pull:
@@ -95,7 +90,9 @@ def pull(
         simulator.run(1)
         state = simulator.state
         length = np.linalg.norm(state.position[end] - state.position[end - 1])
-        force.append(stiffness(cloth) * (length / (state.euler[end, 0] - state.euler[end - 1, 0]) - 1.0))
+        force.append(
+            float(cloth.stretch_stiffness[0]) * (length / (state.euler[end, 0] - state.euler[end - 1, 0]) - 1.0)
+        )
         contact.append(simulator.contact()[1][crossings])
         slid.append(cloth.euler[crossings, 0] - state.euler[crossings, 0])
     return Pull(speed * step * np.arange(steps + 1), np.array(force), np.array(contact), np.array(slid))
@@ -110,7 +107,7 @@ def coulomb(cloth: wy.Cloth, contact: np.ndarray, distance: np.ndarray) -> np.nd
     Args:
         contact: F_n of its crossings at every distance [rows, crossings] (N).
     """
-    ks = stiffness(cloth)
+    ks = float(cloth.stretch_stiffness[0])
     length, k = cloth.spacing, cloth.friction_stiffness
     crossings = contact.shape[1]
     rest = length * np.arange(1, crossings + 2)

@@ -120,6 +120,11 @@ class Cloth:
         return np.concatenate([self.warp, self.weft])
 
     @property
+    def stretch_stiffness(self) -> np.ndarray:
+        """kₛ = Y π R² of every material [materials] (N)."""
+        return np.array([yarn.stretch for yarn in self.yarns]) * np.pi * self.radius**2
+
+    @property
     def euler(self) -> np.ndarray:
         """(u, v) of every node at rest [nodes, 2]."""
         row, column = np.divmod(np.arange(self.nodes), self.weave.columns)

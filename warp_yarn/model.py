@@ -104,12 +104,10 @@ class Model:
     def _newton_tolerance(self) -> float:
         """The default, after the step's error."""
         cloth = self.scene.cloth
-        speeds = [
-            np.sqrt(yarn.stretch * np.pi * cloth.radius**2 / yarn.density) for yarn in cloth.yarns if yarn.stretch
-        ]
-        if self.precision == "single" or not speeds:
+        speed = np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns])
+        if self.precision == "single" or not speed.any():
             return NEWTON_TOLERANCE
-        resolved = RESOLVED * cloth.spacing / min(speeds)
+        resolved = RESOLVED * cloth.spacing / speed[speed > 0.0].min()
         return max(EXACT, NEWTON_TOLERANCE * min(1.0, self.step_size / resolved) ** 2)
 
     def _form_team(self, threads: int) -> None:
