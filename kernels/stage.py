@@ -35,6 +35,10 @@ TURNED = 0.9
 SLOW = 0.3
 """Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
+CAUTION = 4.0
+"""A step of the iteration that is not looked at is taken to leave at most so many times the part of a residual that the
+worst in this time step left: at 1, 2 and 4 one stage in 10, 14 and 20 ended above its tolerance (5 % of them, the worst
+at 9 times the tolerance; ``benchmarks/motions.py``, 5 × 5 and 17 × 17)."""
 TURNING = 0.03
 """Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one
 iteration did with that of the first stage, above 0.045, two to seven, and one or two with its own (17 × 17)."""
@@ -162,9 +166,11 @@ def define(variant: Variant) -> SimpleNamespace:
         slope: wp.array(dtype=scalar),
         step_length: wp.array(dtype=scalar),
         size: wp.array(dtype=scalar),
+        contraction: wp.array(dtype=scalar),
         tries: wp.array(dtype=int),
         # what to do next, and report, out
         continues: wp.array(dtype=int),
+        finishes: wp.array(dtype=int),
         solves: wp.array(dtype=int),
         refreshes: wp.array(dtype=int),
         newton_iterations: wp.array(dtype=int),
@@ -213,6 +219,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first = tries[0] == 0
         tries[0] = tries[0] + 1
         continues[0] = 1
+        finishes[0] = 0
         solves[0] = 1
         refreshes[0] = 0
         stalled = tries[0] > wp.static(MOST_TRIES)
@@ -223,6 +230,8 @@ def define(variant: Variant) -> SimpleNamespace:
         if first or (ordered and (now < before or turned > scalar(-TURNED) * slope[0])):
             if not first:
                 newton_iterations[0] = newton_iterations[0] + 1
+                # of the worst iteration of the step
+                contraction[0] = wp.max(now / before, wp.where(newton_iterations[0] > 1, contraction[0], scalar(0.0)))
                 # a step that hardly helps: the matrix is of another state
                 if now > scalar(SLOW) * before:
                     refreshes[0] = 1
@@ -233,6 +242,11 @@ def define(variant: Variant) -> SimpleNamespace:
             if now <= newton_tolerance[0] * scale or settled:
                 continues[0] = 0
                 refreshes[0] = 0
+            elif now * contraction[0] * scalar(CAUTION) <= newton_tolerance[0] * scale:
+                continues[0] = 0
+                refreshes[0] = 0
+                finishes[0] = 1
+                newton_iterations[0] = newton_iterations[0] + 1
         else:
             solves[0] = 0
             refreshes[0] = 1
@@ -242,8 +256,10 @@ def define(variant: Variant) -> SimpleNamespace:
             residual[0] = before / scale
         if status[0] != 0:
             continues[0] = 0
+            finishes[0] = 0
         elif not wp.isfinite(before) or not wp.isfinite(scale):
             continues[0] = 0
+            finishes[0] = 0
             status[0] = wp.static(NOT_FINITE)
             status[1] = -1
             for i in range(nodes):

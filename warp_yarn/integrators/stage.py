@@ -29,10 +29,11 @@ class StageMethod:
     q + t w₁ and q̇ + t (w₁ − q̇)/η: there a second stage starts, or the step ends if there is none. Where carried is 0
     the stage itself ends the step, and so does a second stage.
 
-    Newton's iteration ends where ‖r‖ ≤ newton_tolerance · ‖w‖, in the norms of ``judge``. Along δ it takes a full
-    step unless that overshoots: r·δ is minus the slope of the energy that a stage minimizes, where there is one, and
-    must not turn to more than 0.9 of itself with the other sign, or else ‖r‖ must fall. (That it always falls is too
-    much to ask of yarns that buckle.) Nor may crossings change their order.
+    Newton's iteration ends where ‖r‖ ≤ newton_tolerance · ‖w‖, in the norms of ``judge``, or with a step that gets
+    there by what the time step's other iterations left of their residuals: evaluating that one's would only confirm it.
+    Along δ it takes a full step unless that overshoots: r·δ is minus the slope of the energy that a stage minimizes,
+    where there is one, and must not turn to more than 0.9 of itself with the other sign, or else ‖r‖ must fall. (That
+    it always falls is too much to ask of yarns that buckle.) Nor may crossings change their order.
     """
 
     name: str
@@ -51,9 +52,9 @@ class StageMethod:
         for name in ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before"):
             a[name] = a.zeros(2 * n, scalar) if sliding else None
         a["base_euler"] = a.zeros(2 * n, scalar)
-        for name in ("size", "slope"):
+        for name in ("size", "slope", "contraction"):
             a[name] = a.zeros(1, scalar)
-        for name in ("tries", "continues", "solves", "refreshes", "crosses", "newton_iterations"):
+        for name in ("tries", "continues", "finishes", "solves", "refreshes", "crosses", "newton_iterations"):
             a[name] = a.zeros(1, wp.int32)
         for name in ("stage_size", "carried_time"):
             a[name] = a.zeros(1, scalar)
@@ -123,7 +124,7 @@ class StageMethod:
         model = self.model
         model.take_inputs()
         model.arrays.zero("newton_iterations")
-        self.model.copy(solution="velocity", euler_solution="euler_velocity")
+        model.copy(solution="velocity", euler_solution="euler_velocity", contraction="unit")
         model.prescribe()
         self._set_base()
 
@@ -163,6 +164,13 @@ class StageMethod:
             self._evaluate_as_asked()
         self._judge()
         wp.capture_while(a["continues"], self._iterate)
+        wp.capture_if(a["finishes"], on_true=self._finish_stage)
+
+    def _finish_stage(self) -> None:
+        """The last iteration, without a look at where it led."""
+        self._solve_direction()
+        self.model.launch("correct", "nodes")
+        self.model.launch("enter_stage", "nodes")
 
     def _evaluate_as_asked(self) -> None:
         wp.capture_if(
