@@ -351,6 +351,21 @@ def define(variant: Variant) -> SimpleNamespace:
                 base_euler_velocity[s] += gain_s * carried_rate[0]
 
     @wp.kernel(module=module, enable_backward=False)
+    def estimate_error(
+        nodes: int,
+        step_size: wp.array(dtype=scalar),
+        missing: wp.array(dtype=scalar),
+        predicted: wp.array(dtype=vec3),
+        solution: wp.array(dtype=vec3),
+        step_error: wp.array(dtype=scalar),
+    ):
+        """Of the node that is farthest off: h · missing · |w₂ − what the first stage's acceleration led to|."""
+        most = scalar(0.0)
+        for i in range(nodes):
+            most = wp.max(most, wp.length_sq(at(solution, i) - at(predicted, i)))
+        step_error[0] = wp.sqrt(most) * missing[0] * step_size[0]
+
+    @wp.kernel(module=module, enable_backward=False)
     def recall_first_stage(
         nodes: int,
         counters: wp.array(dtype=int),
@@ -482,6 +497,7 @@ def define(variant: Variant) -> SimpleNamespace:
         keep_order=keep_order,
         ask_for_matrix=ask_for_matrix,
         next_base=next_base,
+        estimate_error=estimate_error,
         recall_first_stage=recall_first_stage,
         recall_carried_stage=recall_carried_stage,
         carry_adjoint=carry_adjoint,

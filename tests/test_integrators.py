@@ -215,7 +215,7 @@ def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
     wave = fabric.spacing / np.sqrt(1.0e5 * np.pi * fabric.radius**2 / soft.density)
 
     def tolerance(step: float, **options: object) -> float:
-        return wy.Simulator(wy.Scene(fabric), step=step, **options).model.newton_tolerance
+        return wy.Simulator(wy.Scene(fabric), step=step, **options).model.newton_tolerance_at(step)
 
     assert tolerance(1e-2) == tolerance(4.001 * wave) == 3e-4
     assert tolerance(wave) == pytest.approx(3e-4 / 16, rel=1e-12)

@@ -156,6 +156,13 @@ class Arrays(dict[str, Any]):
         self["step_size"] = self.zeros(1, scalar)
         self["remaining"] = self.zeros(1, scalar)
 
+    def put(self, name: str, *values: float) -> None:
+        """Sets all numbers of a small array. On the CPU in its own memory: ``assign`` takes 20 µs to get there."""
+        if self.device.is_cpu:
+            self[name].numpy().reshape(-1)[:] = values
+        else:
+            self[name].assign(np.array(values))
+
     def zero(self, *names: str) -> None:
         """Sets arrays to 0, those that the scene has."""
         for name in names:

@@ -6,6 +6,7 @@ What a time step is made of, without saying how: that is for ``integrators``.
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -81,10 +82,12 @@ class Model:
         exact = differentiable and precision == "double"
         default = EXACT if exact else TOLERANCES[precision]
         self.tolerance = number("tolerance", default if tolerance is None else tolerance, above=0.0)
-        default = EXACT if exact else self._newton_tolerance()
-        self.newton_tolerance = number(
-            "newton_tolerance", default if newton_tolerance is None else newton_tolerance, above=0.0
-        )
+        if newton_tolerance is None and exact:
+            newton_tolerance = EXACT
+        self._resolving = self._resolving_rate()
+        self._newton_tolerance = None
+        if newton_tolerance is not None:
+            self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0)
         degrees = scene.cloth.nodes * (5 if scene.sliding else 3)
         most = max(1000, degrees) if max_iterations is None else max_iterations
         self.max_iterations = whole("max_iterations", most, least=1)
@@ -96,19 +99,24 @@ class Model:
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
         self.arrays = Arrays(scene, variant, self.device)
-        self.set_times(self.step_size, self.step_size)
+        self.set_times(self.step_size, self.step_size, self.step_size)
         self.arrays["tolerance"] = self.arrays.numbers(self.tolerance)
         self._form_team(whole("threads", threads, least=1))
         self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
 
-    def _newton_tolerance(self) -> float:
-        """The default, after the step's error."""
+    def newton_tolerance_at(self, step: float) -> float:
+        """As given, or what follows the error of steps of this size."""
+        if self._newton_tolerance is not None:
+            return self._newton_tolerance
+        return max(EXACT, NEWTON_TOLERANCE * min(1.0, step * self._resolving) ** 2)
+
+    def _resolving_rate(self) -> float:
+        """Of steps that begin to resolve the yarns' stretching [1/s]."""
         cloth = self.scene.cloth
         speed = np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns])
         if self.precision == "single" or not speed.any():
-            return NEWTON_TOLERANCE
-        resolved = RESOLVED * cloth.spacing / speed[speed > 0.0].min()
-        return max(EXACT, NEWTON_TOLERANCE * min(1.0, self.step_size / resolved) ** 2)
+            return math.inf
+        return speed[speed > 0.0].min() / (RESOLVED * cloth.spacing)
 
     def _form_team(self, threads: int) -> None:
         """Strips of the cloth for so many processor cores (``kernels/team.py``)."""
@@ -133,21 +141,18 @@ class Model:
         team = self.arrays["team"]
         team.assign(np.where(np.arange(len(team)) == 3, strips, 0).astype(np.int32))
 
-    def set_times(self, step: float, remaining: float) -> None:
-        """The step that kernels make, with eq. 2's factors of M, D and H in the matrix: 1, h and h².
+    def set_times(self, step: float, remaining: float, stage: float) -> None:
+        """The step that kernels make.
 
         Args:
             step: h [s].
             remaining: time in which exact pins reach their targets [s]; more than h in a part of a step.
+            stage: of an implicit stage [s]: the matrix is M + stage · D + stage² · H.
         """
         a = self.arrays
-        a["step_size"].assign(np.array([step]))
-        a["remaining"].assign(np.array([remaining]))
-        self.set_weights(step)
-
-    def set_weights(self, size: float) -> None:
-        """The factors of M, D and H in the matrix of an implicit step of this size [s]."""
-        self.arrays["weights"].assign(np.array([[1.0, size, size * size]]))
+        a.put("step_size", step)
+        a.put("remaining", remaining)
+        a.put("weights", 1.0, stage, stage * stage)
 
     def launch(self, kernel: str, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel by its name (see ``Arrays.launch``)."""

@@ -8,18 +8,17 @@ import numpy as np
 import tqdm
 
 from .arrays import STATE_TYPES
-from .errors import InputError, SimulationError, choice, whole
+from .errors import InputError, SimulationError, choice, number, whole
 from .integrators import INTEGRATORS
 from .kernels import step
 from .model import Model
+from .parts import Parts
 from .scene import Scene
 from .state import FIELDS, State, Trajectory
 from .system import System, gather
 
 CHUNK_BYTES = 1 << 24
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
-SMALLEST_PART = 2.0**-7
-"""Of a step: one that cannot be made is split in two, and its halves again, down to this."""
 
 
 class Simulator:
@@ -44,6 +43,9 @@ class Simulator:
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
             are free. They pay on large cloths (``benchmarks/bandwidth.py``).
+        step_error: how far any node may be put wrong in a part of a step, in spacings of the yarns; each step is then
+            made in as many parts as that takes, and ``step`` is the time from frame to frame. For "sdirk2", whose
+            stages tell its error. None: steps are made at once.
         chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
         differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
 
@@ -51,6 +53,7 @@ class Simulator:
         state: the present state; set it to start from another one.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up.
         split_steps: which of the steps since the beginning could only be made in parts, and the smallest of these [s].
+        parts: what makes steps in parts; counts those that it made and rejected.
         arrays: the scene's arrays on the device, by the names that kernels use.
     """
 
@@ -67,6 +70,7 @@ class Simulator:
         newton_tolerance: float | None = None,
         max_iterations: int | None = None,
         threads: int = 1,
+        step_error: float | None = None,
         chunk: int | None = None,
         differentiable: bool = False,
     ):
@@ -85,6 +89,15 @@ class Simulator:
         )
         self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
         self.integrator = method(self.model)
+        self.step_error = None if step_error is None else number("step_error", step_error, above=0.0)
+        if step_error is not None:
+            if differentiable:
+                raise InputError("step_error with differentiable: gradients go back through whole steps; leave one out")
+            if method.local_error is None:
+                able = ", ".join(repr(name) for name, other in INTEGRATORS.items() if other.local_error is not None)
+                raise InputError(f"step_error with integrator = {integrator!r}: only {able} estimates its error")
+            self.integrator.estimate_errors()
+        self.parts = Parts(self.model, self.integrator, self.step_error and self.step_error * scene.cloth.spacing)
         self.steps_done = 0
         self.split_steps: dict[int, float] = {}
         fitting = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
@@ -160,7 +173,8 @@ class Simulator:
         made = 0
         with self.model.team():
             while made < steps:
-                made += self._advance(steps - made)
+                if self.step_error is None:
+                    made += self._advance(steps - made)
                 if made < steps and not self._make_in_parts(made):
                     break
                 made = min(made + 1, steps)
@@ -169,7 +183,7 @@ class Simulator:
 
     def _count(self, frame: int) -> None:
         """Tells the device which frame of the chunk the present state is."""
-        self.arrays["counters"].assign(np.array([frame, self.steps_done + frame], dtype=np.int32))
+        self.arrays.put("counters", frame, self.steps_done + frame)
 
     def _advance(self, steps: int) -> int:
         """Makes steps until one fails; how many were made."""
@@ -184,31 +198,18 @@ class Simulator:
 
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
-        self._upload(self._frame(frame))
-        smallest = self._halves(frame, 0.0, 1.0)
+        if self.step_error is None:
+            # it could not be made at once
+            self._upload(self._frame(frame))
+            self.arrays.zero("status")
+            self.parts.size = 0.5
+        smallest = self.parts.make(lambda: self._count(frame))
         self.integrator.set_times(self.step_size, self.step_size)
-        if smallest:
+        if smallest and self.step_error is None:
             self.split_steps[self.steps_done + frame + 1] = smallest * self.step_size
+        if smallest:
             self._count(frame + 1)
         return smallest > 0.0
-
-    def _halves(self, frame: int, done: float, size: float) -> float:
-        """Makes a part of a step, of which so much is done, in two; the smallest part made, 0 where one failed."""
-        half = 0.5 * size
-        first = self._part(frame, done, half)
-        return min(first, self._part(frame, done + half, half)) if first else 0.0
-
-    def _part(self, frame: int, done: float, size: float) -> float:
-        """Makes a part of a step, at once or in halves; the smallest part made, 0 where one failed."""
-        before, step = self.state, self.step_size
-        self._count(frame)
-        self.arrays.zero("status")
-        self.integrator.set_times(size * step, (1.0 - done) * step)
-        self.integrator.advance()
-        if not self.arrays["status"].numpy()[0]:
-            return size
-        self._upload(before)
-        return self._halves(frame, done, size) if 0.5 * size >= SMALLEST_PART else 0.0
 
     def run(self, steps: int, *, progress: bool = False) -> Trajectory:
         """Makes steps and returns every frame, the present one first.
@@ -275,6 +276,7 @@ class Simulator:
         where = f"step {k} (t = {k * self.step_size:g} s):"
         if node >= 0:
             where += f" at node {node} (row {node // columns}, column {node % columns})"
+        smallest = self.parts.tried * self.step_size
         what = {
             step.NOT_FINITE: "a value is not finite",
             step.ORDER_LOST: "Δs to the next crossing of the yarn reached 0",
@@ -284,12 +286,12 @@ class Simulator:
             ),
             step.STALLED: (
                 f"Newton's iteration stopped at a residual of {residual:.1e}, "
-                f"above its tolerance of {self.model.newton_tolerance:.1e}"
+                f"above its tolerance of {self.model.newton_tolerance_at(smallest):.1e}"
             ),
         }[code]
         raise SimulationError(
             f"{where} {what}. The largest term {'there ' if node >= 0 else ''}is {term!r}. "
-            f"It was tried in parts as small as {SMALLEST_PART * self.step_size:.1e} s; "
+            f"It was tried in parts as small as {smallest:.1e} s; "
             f"the {len(trajectory)} frames before are in this error's trajectory",
             step=k,
             node=node,
@@ -368,7 +370,7 @@ class Simulator:
         """
         h = self.step_size
         with _Visit(self, state):
-            self.arrays["weights"].assign(np.array([weights or (1.0, h, h * h)]))
+            self.arrays.put("weights", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             system = gather(self.model)
         self.integrator.set_times(h, h)

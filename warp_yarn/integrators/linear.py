@@ -19,6 +19,7 @@ class LinearlyImplicitEuler:
 
     name = "linear"
     order = 1
+    local_error = None
 
     def __init__(self, model: Model):
         self.model = model
@@ -27,7 +28,7 @@ class LinearlyImplicitEuler:
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
-        self.model.set_times(step, remaining)
+        self.model.set_times(step, remaining, step)
 
     def advance(self) -> None:
         """Makes a step, and records it. Captured at the first call: replayed, its twenty launches cost microseconds."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import warp as wp
 
 from ..kernels.ros2 import GAMMA
@@ -44,6 +43,7 @@ class ROS2(LinearlyImplicitEuler):
 
     name = "ros2"
     order = 2
+    local_error = None
 
     def __init__(self, model: Model):
         super().__init__(model)
@@ -56,9 +56,8 @@ class ROS2(LinearlyImplicitEuler):
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
-        self.model.set_times(step, remaining)
-        self.model.set_weights(GAMMA * step)
-        self.model.arrays["stage_size"].assign(np.array([GAMMA * step]))
+        self.model.set_times(step, remaining, GAMMA * step)
+        self.model.arrays.put("stage_size", GAMMA * step)
 
     def _step(self) -> None:
         model, a = self.model, self.model.arrays

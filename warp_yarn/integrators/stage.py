@@ -41,6 +41,8 @@ class StageMethod:
     fraction: float
     carried: float
     stages: int
+    local_error: float | None = None
+    """c of the error c h³ d³q/dt³ of a step, where its stages tell the third derivative."""
 
     def __init__(self, model: Model):
         self.model = model
@@ -60,7 +62,7 @@ class StageMethod:
             a[name] = a.zeros(1, scalar)
         rate = self.carried / self.fraction
         numbers = {"carried_rate": rate, "unit": 1.0, "step_length": 1.0, "shortest": 1e30}
-        numbers |= {"newton_tolerance": model.newton_tolerance, "inner_tolerance": INNER_TOLERANCE}
+        numbers |= {"newton_tolerance": 1.0, "inner_tolerance": INNER_TOLERANCE}
         for name, value in numbers.items():
             a[name] = a.numbers(value)
         self.set_times(model.step_size, model.step_size)
@@ -68,11 +70,11 @@ class StageMethod:
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
-        a, eta = self.model.arrays, self.fraction * step
-        self.model.set_times(step, remaining)
-        self.model.set_weights(eta)
-        a["stage_size"].assign(np.array([eta]))
-        a["carried_time"].assign(np.array([self.carried * step]))
+        a, stage = self.model.arrays, self.fraction * step
+        self.model.set_times(step, remaining, stage)
+        a.put("newton_tolerance", self.model.newton_tolerance_at(step))
+        a.put("stage_size", stage)
+        a.put("carried_time", self.carried * step)
 
     # -- graphs ------------------------------------------------------------------------------------------------------
 
@@ -98,7 +100,11 @@ class StageMethod:
             if stage:
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
+                if "predicted" in model.arrays:
+                    model.copy(predicted="solution")
             self._newton(first=stage == 0)
+        if "predicted" in model.arrays:
+            model.launch("estimate_error", 1)
         if self._is_carried:
             model.launch("next_base", "nodes", start=None)
             self.model.copy(
@@ -108,6 +114,16 @@ class StageMethod:
                 euler_velocity="base_euler_velocity",
             )
         model.end_step()
+
+    def estimate_errors(self) -> None:
+        """Makes steps leave an estimate of their error in ``step_error`` [m]: c h³ (a₂ − a₁)/(t₂ − t₁), of the
+        accelerations at both stages' times. The second stage starts from the first's gain of velocity, η a₁, so it is
+        in proportion to what Newton's iteration adds to that."""
+        a = self.model.arrays
+        a["predicted"] = a.zeros(a["nodes"], a.variant.vec3)
+        a["step_error"] = a.zeros(1, a.variant.scalar)
+        a["missing"] = a.numbers(self.local_error / (self.fraction * self.carried))
+        self._graphs = {}
 
     @property
     def _is_carried(self) -> bool:
