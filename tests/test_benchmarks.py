@@ -15,6 +15,7 @@ from warp_yarn.ablation import ablate
 solver = load("benchmarks/solver.py")
 work = load("benchmarks/work_precision.py")
 equal = load("benchmarks/equal_error.py")
+control = load("benchmarks/step_control.py")
 sizes = load("benchmarks/sizes.py")
 bandwidth = load("benchmarks/bandwidth.py")
 terms = load("benchmarks/terms.py")
@@ -179,6 +180,27 @@ def test_methods_are_timed_beside_each_other():
     seconds = equal.side_by_side(motion, 3, {"linear": 50, "sdirk2": 5}, repeats=2)
     assert [len(times) for times in seconds.values()] == [2, 2]
     assert min(map(min, seconds.values())) > 0.0
+
+
+# -- benchmarks/step_control.py ---------------------------------------------------------------------------------------
+
+
+def test_parts_are_compared_with_even_steps_of_their_error(monkeypatch):
+    motion = control.MOTIONS["hung"]
+    position = control.end(motion.simulator(3, step=2.5e-4), 100)
+    moved = work.distance(position, motion.scene(3).cloth.position)
+    monkeypatch.setattr(control, "reference", lambda motion, size: work.Reference(position, moved, "", 0.0))
+    monkeypatch.setattr(control, "COUNTS", (5, 80))
+    monkeypatch.setattr(control, "STEP_ERRORS", (1e-2, 1e-3))
+    # even steps take a second each
+    monkeypatch.setattr(control, "turns", lambda runs, repeats: [[5.0], [80.0], [20.0], [20.0]])
+    even, finer, loose, tight = control.rows(motion, "hung", 3, 1)
+    assert (even["steps"], finer["steps"], even["step error"], loose["step error"]) == (5, 80, "even", 1e-2)
+    assert 5 < loose["steps"] < tight["steps"] < 80
+    assert even["error"] > loose["error"] > tight["error"] > finer["error"]
+    for row in (loose, tight):
+        share = np.log(even["error"] / row["error"]) / np.log(even["error"] / finer["error"])
+        assert row["of even's"] == pytest.approx(20.0 / (5.0 * 16.0**share))
 
 
 # -- benchmarks/sizes.py ----------------------------------------------------------------------------------------------
