@@ -467,6 +467,40 @@ def define(variant: Variant) -> SimpleNamespace:
                 status[1] = i
 
     @wp.kernel(module=module, enable_backward=False)
+    def judge_adjoint(
+        nodes: int,
+        inverse_x: wp.array(dtype=vec3),
+        inverse_s: wp.array(dtype=scalar),
+        seed: wp.array(dtype=vec3),
+        euler_seed: wp.array(dtype=scalar),
+        adjoint_tolerance: wp.array(dtype=scalar),
+        status: wp.array(dtype=int),
+        tries: wp.array(dtype=int),
+        size: wp.array(dtype=scalar),
+        first_size: wp.array(dtype=scalar),
+        continues: wp.array(dtype=int),
+    ):
+        """Whether ρ is to fall further, and falls: ‖ρ‖ is in the norm of ``judge``."""
+        total = scalar(0.0)
+        for i in range(nodes):
+            r = at(seed, i)
+            total += wp.dot(wp.cw_mul(at(inverse_x, i), r), r)
+            if wp.static(sliding):
+                for s in range(2 * i, 2 * i + 2):
+                    total += at(inverse_s, s) * at(euler_seed, s) * at(euler_seed, s)
+        now = wp.sqrt(total)
+        falls = bool(True)
+        if tries[0] == 0:
+            first_size[0] = now
+        else:
+            falls = now < scalar(0.5) * size[0]
+        tries[0] = tries[0] + 1
+        size[0] = now
+        continues[0] = 0
+        if falls and status[0] == 0 and now > adjoint_tolerance[0] * first_size[0]:
+            continues[0] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
     def absorb_stage(
         position_grad: wp.array(dtype=vec3),
         euler_grad: wp.array(dtype=scalar),
@@ -502,5 +536,6 @@ def define(variant: Variant) -> SimpleNamespace:
         recall_carried_stage=recall_carried_stage,
         carry_adjoint=carry_adjoint,
         stage_adjoint_residual=stage_adjoint_residual,
+        judge_adjoint=judge_adjoint,
         absorb_stage=absorb_stage,
     )

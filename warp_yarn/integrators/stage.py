@@ -237,6 +237,8 @@ class StageMethod:
             for name in ("stage_adjoint", "zero", "first_solution"):
                 a[name] = a.zeros(n, vec3)
                 a[f"euler_{name}"] = a.zeros(2 * n, scalar) if sliding else None
+            a["first_size"] = a.zeros(1, scalar)
+            a["adjoint_tolerance"] = a.numbers(max(model.tolerance, 10.0 * self._rounding))
         base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
         a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if sliding:
@@ -310,20 +312,45 @@ class StageMethod:
         self.model.factorize()
 
     def _solve_adjoint(self) -> None:
-        """λ of (−∂r/∂w)ᵀ λ = ρ₀, by GMRES with the preconditioner A, and reverse mode with all of it.
+        """λ of (−∂r/∂w)ᵀ λ = ρ₀: reverse mode with all of it, and its share of the adjoints of q₀ and v₀."""
+        a = self.model.arrays
+        self._run(self._descend)
+        size, first = (float(a[name].numpy()[0]) for name in ("size", "first_size"))
+        wanted = float(a["adjoint_tolerance"].numpy()[0]) * first
+        if not size <= wanted and not a["status"].numpy()[0]:
+            self._minimize(size, wanted)
+        self._run(self._absorb)
 
-        A alone, as in Newton's iteration, would do for ordinary motion; where yarns slide fast it need not contract.
+    def _descend(self) -> None:
+        """Parts of λ, each A⁻¹ ρ of what the parts before it left, as long as they more than halve ρ.
+
+        Reverse mode adds to what it has added for the parts before: in the end it has run for all of λ.
         """
         a = self.model.arrays
-        self._run(self._gather)
+        a.zero("tries")
+        self._gather()
+        self.model.launch("judge_adjoint", 1)
+        wp.capture_while(a["continues"], self._descend_once)
+
+    def _descend_once(self) -> None:
+        self._solve_part()
+        self._reverse()
+        self._gather()
+        self.model.launch("judge_adjoint", 1)
+
+    def _minimize(self, first: float, wanted: float) -> None:
+        """What is left of λ, from a ρ of size ``first``, by GMRES with the preconditioner A, to a size ``wanted``.
+
+        Where yarns slide fast, A alone need not contract.
+        """
+        a = self.model.arrays
         rho = self._vector("seed")
         # Products with the derivative run all of reverse mode: what it adds to is put back, and added to at the end.
         kept = {name: a[name].grad.numpy().copy() for name in self._added}
         weight = np.sqrt(self._vector("inverse_x", "inverse_s"))
-        first = float(np.linalg.norm(weight * rho))
         basis, parts, columns = [], [], []
         combination, size = np.zeros(0), first
-        while size > max(self.model.tolerance, 10.0 * self._rounding) * first:
+        while size > wanted:
             if len(parts) == MOST_PARTS or not np.isfinite(size) or a["status"].numpy()[0]:
                 self._stall(size / first)
                 return
@@ -359,7 +386,6 @@ class StageMethod:
         self._set_vector("rhs", total, gradient=True)
         self._run(self._reverse)
         self._run(self._gather)
-        self._run(self._absorb)
 
     def _vector(self, *names: str, gradient: bool = False) -> np.ndarray:
         """An array of the positions and its companion of (u, v), as one vector; named by the first, or by both."""
