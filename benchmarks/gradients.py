@@ -2,9 +2,10 @@
 
     python benchmarks/gradients.py [--quick] [--results FOLDER]
 
-Cost: a run of the hung cloth from rest, and the gradient of a loss of its last frame with respect to the materials,
-the numbers of crossings and of the wind, and the initial velocities, all at once. "forward" and "backward" are of one
-step: the call of a Rollout and loss.backward(), divided by the steps; "ratio" is the median of the ratios of each turn.
+Cost: a run of the hung cloth from rest, by eq. 2 and by the default method, and the gradient of a loss of its last
+frame with respect to the materials, the numbers of crossings and of the wind, and the initial velocities, all at once.
+"forward" and "backward" are of one step: the call of a Rollout and loss.backward(), divided by the steps; "ratio" is
+the median of the ratios of each turn.
 
 Memory: "kept" is what the graph of the call holds for the backward pass, its tensors counted; "measured" is what the
 process grew by, from a run of few steps to one of many, where the system tells.
@@ -57,6 +58,9 @@ EXACT = 1e-14
 EVERY = (1, 8)
 """Checkpoints of the cost table: off, and on."""
 
+METHODS = ("linear", "sdirk2")
+"""Eq. 2 and the default, in the cost table; the others are eq. 2's."""
+
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 
 
@@ -79,11 +83,11 @@ def inputs(rollout: wt.Rollout, names: Sequence[str]) -> dict[str, torch.Tensor]
 class Case:
     """Forward and backward runs of a hung cloth, timed by the step."""
 
-    def __init__(self, size: int, steps: int, every: int = 1, **options: Any):
+    def __init__(self, size: int, steps: int, every: int = 1, method: str = "linear", **options: Any):
         scene = paper.hung_cloth(rows=size, columns=size, **options)
         self.steps = steps
         self.rollout = wt.Rollout(
-            scene, steps, frames=[steps], checkpoint_every=every, step=paper.STEP, integrator="linear"
+            scene, steps, frames=[steps], checkpoint_every=every, step=paper.STEP, integrator=method
         )
         self.inputs = inputs(self.rollout, [name for name in WANTED if scene.sliding or name != "euler_velocity"])
         self.ratios: list[float] = []
@@ -128,11 +132,11 @@ def state_bytes(scene: wy.Scene) -> int:
     return 8 * (3 + 3 + (2 + 2 + 2 if scene.sliding else 0)) * scene.cloth.nodes
 
 
-def growth(size: int, every: int, few: int, many: int) -> float | None:
+def growth(size: int, every: int, method: str, few: int, many: int) -> float | None:
     """Bytes that the process grows by for each further step whose gradient can still be asked for."""
     grown = {}
     for steps in (few, many):
-        case = Case(size, steps, every)
+        case = Case(size, steps, every, method)
         case.call()  # compiles, and makes what does not depend on the steps
         settle()
         before = resident()
@@ -147,16 +151,17 @@ def growth(size: int, every: int, few: int, many: int) -> float | None:
 
 def cost(size: int, every: Sequence[int], steps: int, repeats: int, few: int, many: int) -> list[dict[str, Any]]:
     """Rows of the cost table for one size, all timed in turn."""
-    cases = {k: Case(size, steps, k) for k in every}
+    cases = {(method, k): Case(size, steps, k, method) for method in METHODS for k in every}
     timings = measure([f for case in cases.values() for f in (case.forward, case.backward)], repeats)
     rows = []
-    for at, (k, case) in enumerate(cases.items()):
+    for at, ((method, k), case) in enumerate(cases.items()):
         forward, backward = timings[2 * at : 2 * at + 2]
         ratio, state = case.ratio, state_bytes(case.rollout.scene)
-        kept, measured = kept_bytes(case.call()), growth(size, k, few, many)
+        kept, measured = kept_bytes(case.call()), growth(size, k, method, few, many)
         rows.append(
             {
                 "size": f"{size} × {size}",
+                "method": method,
                 "checkpoint_every": k,
                 "steps": steps,
                 **forward.columns("forward"),

@@ -133,12 +133,13 @@ def test_what_is_kept_is_the_states_alone(sliding, every):
 
 def test_a_row_of_the_cost_table(tmp_path):
     rows = gradients.cost(4, (1, 3), STEPS, repeats=1, few=2, many=4)
-    assert [row["checkpoint_every"] for row in rows] == [1, 3]
+    methods = [(row["method"], row["checkpoint_every"]) for row in rows]
+    assert methods == [("linear", 1), ("linear", 3), ("sdirk2", 1), ("sdirk2", 3)]
     assert all(row["backward [ms]"] > 0.0 and row["forward [ms]"] > 0.0 and row["ratio"] > 0.0 for row in rows)
     path = tmp_path / "cost.csv"
     gradients.write_csv(path, rows, gradients.environment("torch"))
     with open(path, newline="") as file:
-        assert [row["size"] for row in csv.DictReader(file)] == ["4 × 4"] * 2
+        assert [row["size"] for row in csv.DictReader(file)] == ["4 × 4"] * 4
 
 
 def test_the_times_of_forward_only_users_are_of_plain_simulators(monkeypatch):
