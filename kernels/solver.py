@@ -25,6 +25,48 @@ from .step import NOT_CONVERGED, NOT_FINITE
 from .variant import Variant
 
 
+# A row of a 3 × 3 block and a number more, which counts for nothing: behind every block stands another, for the last node
+# has no upper neighbour. The compiler finds no such vectors by itself, and by single numbers it is twice the instructions.
+_ROW = """
+    typedef SCALAR row __attribute__((vector_size(4 * sizeof(SCALAR)), aligned(sizeof(SCALAR))));
+    const int* j = neighbour.data + stencil * i;
+    const SCALAR* m = &upper_xx.data[stencil * i].data[0][0];
+"""
+_GATHER = (
+    _ROW
+    + """
+    row a = {}, b = {}, c = {};
+    for (int slot = stencil - 1; slot >= 0; --slot) {
+        if (j[slot] >= 0) {
+            const SCALAR* of = x.data[j[slot]].c;
+            const row its = {of[0], of[1], of[2], SCALAR(0)};
+            a += *(const row*)(m + 9 * slot) * its;
+            b += *(const row*)(m + 9 * slot + 3) * its;
+            c += *(const row*)(m + 9 * slot + 6) * its;
+        }
+    }
+    return {a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2]};
+"""
+)
+_SPREAD = (
+    _ROW
+    + """
+    for (int slot = 0; slot < stencil; ++slot) {
+        if (j[slot] >= 0) {
+            SCALAR* of = y.data[j[slot]].c;
+            row its = {of[0], of[1], of[2], SCALAR(0)};
+            its -= *(const row*)(m + 9 * slot) * x.c[0];
+            its -= *(const row*)(m + 9 * slot + 3) * x.c[1];
+            its -= *(const row*)(m + 9 * slot + 6) * x.c[2];
+            of[0] = its[0];
+            of[1] = its[1];
+            of[2] = its[2];
+        }
+    }
+"""
+)
+
+
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
     """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
@@ -35,6 +77,27 @@ def functions(variant: Variant) -> SimpleNamespace:
     def times(m: mat33, x: vec3) -> vec3:
         """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
         return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
+
+    number = "double" if scalar is wp.float64 else "float"
+
+    @wp.func_native(_GATHER.replace("SCALAR", number))
+    def gather_positions(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3),
+    ) -> vec3: ...
+
+    @wp.func_native(_SPREAD.replace("SCALAR", number))
+    def spread_positions(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        x: vec3,
+        y: wp.array(dtype=vec3),
+    ): ...
 
     @wp.func
     def gather(
@@ -52,24 +115,21 @@ def functions(variant: Variant) -> SimpleNamespace:
         y = vec3()
         y_u = scalar(0.0)
         y_v = scalar(0.0)
-        for turn in range(6):
-            slot = 5 - turn
-            if slot < stencil:
-                k = stencil * i + slot
-                j = at(neighbour, k)
-                if j >= 0:
-                    its = at(x, j)
-                    y += times(at(upper_xx, k), its)
-                    if wp.static(sliding):
-                        if slot < 4:
-                            e = 4 * i + slot
-                            along = at(s, 2 * j + slot % 2)
-                            y += at(upper_xs, e) * along
-                            row = wp.dot(at(upper_sx, e), its) + at(upper_ss, e) * along
-                            if slot % 2 == 0:
-                                y_u += row
-                            else:
-                                y_v += row
+        if wp.static(sliding):
+            for turn in range(4):
+                slot = 3 - turn
+                if slot < stencil:
+                    j = at(neighbour, stencil * i + slot)
+                    if j >= 0:
+                        e = 4 * i + slot
+                        along = at(s, 2 * j + slot % 2)
+                        y += at(upper_xs, e) * along
+                        row = wp.dot(at(upper_sx, e), at(x, j)) + at(upper_ss, e) * along
+                        if slot % 2 == 0:
+                            y_u += row
+                        else:
+                            y_v += row
+        y += gather_positions(i, stencil, neighbour, upper_xx, x)
         return y, y_u, y_v
 
     @wp.func
@@ -88,22 +148,19 @@ def functions(variant: Variant) -> SimpleNamespace:
         y_s: wp.array(dtype=scalar),
     ):
         """y −= Uᵀ (x, u, v), what row i of U gives to others."""
-        for slot in range(6):
-            if slot < stencil:
-                k = stencil * i + slot
-                j = at(neighbour, k)
-                if j >= 0:
-                    y = at(y_x, j) - x * at(upper_xx, k)
-                    if wp.static(sliding):
-                        if slot < 4:
-                            e = 4 * i + slot
-                            mine = u
-                            if slot % 2 == 1:
-                                mine = v
-                            y -= at(upper_sx, e) * mine
-                            its = 2 * j + slot % 2
-                            put(y_s, its, at(y_s, its) - wp.dot(at(upper_xs, e), x) - at(upper_ss, e) * mine)
-                    put(y_x, j, y)
+        if wp.static(sliding):
+            for slot in range(4):
+                if slot < stencil:
+                    j = at(neighbour, stencil * i + slot)
+                    if j >= 0:
+                        e = 4 * i + slot
+                        mine = u
+                        if slot % 2 == 1:
+                            mine = v
+                        put(y_x, j, at(y_x, j) - at(upper_sx, e) * mine)
+                        its = 2 * j + slot % 2
+                        put(y_s, its, at(y_s, its) - wp.dot(at(upper_xs, e), x) - at(upper_ss, e) * mine)
+        spread_positions(i, stencil, neighbour, upper_xx, x, y_x)
 
     @wp.func
     def multiply(
