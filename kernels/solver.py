@@ -25,63 +25,37 @@ from .step import NOT_CONVERGED, NOT_FINITE
 from .variant import Variant
 
 
-# On the CPU, rows of a 3 × 3 block with a number more, which counts for nothing: the machine has vectors of four, and for
-# rows of three, or loops over four, the compiler makes twice the instructions. Behind every block that is read stands
-# another, for the last node has no upper neighbour.
-_ROW = """
-    const int* j = neighbour.data + stencil * i;
-    const auto* block = upper_xx.data + stencil * i;
-#if !defined(__CUDA_ARCH__)
-    typedef SCALAR row __attribute__((vector_size(4 * sizeof(SCALAR)), aligned(sizeof(SCALAR)), may_alias));
-#endif
-"""
-_GATHER = (
-    _ROW
-    + """
-#if defined(__CUDA_ARCH__)
-    wp::vec_t<3, SCALAR> sum;
-    for (int slot = stencil - 1; slot >= 0; --slot)
-        if (j[slot] >= 0)
-            sum = wp::add(sum, wp::mul(block[slot], x.data[j[slot]]));
-    return sum;
-#else
+_GATHER = """
     row a = {}, b = {}, c = {};
     for (int slot = stencil - 1; slot >= 0; --slot) {
-        if (j[slot] >= 0) {
-            const SCALAR* m = block[slot].data[0];
-            const SCALAR* of = x.data[j[slot]].c;
-            const row its = {of[0], of[1], of[2], SCALAR(0)};
-            a += *(const row*)m * its;
-            b += *(const row*)(m + 3) * its;
-            c += *(const row*)(m + 6) * its;
+        const int j = neighbour.data[stencil * i + slot];
+        if (j >= 0) {
+            const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+            const SCALAR* of = x.data[j].c;
+            const row its = {of[0], of[1], of[2], 0};
+            a = a + *(const row*)m * its;
+            b = b + *(const row*)(m + 3) * its;
+            c = c + *(const row*)(m + 6) * its;
         }
     }
     return {a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2]};
-#endif
 """
-)
-_SPREAD = (
-    _ROW
-    + """
+_SPREAD = """
     for (int slot = 0; slot < stencil; ++slot) {
-        if (j[slot] >= 0) {
-#if defined(__CUDA_ARCH__)
-            y.data[j[slot]] = wp::sub(y.data[j[slot]], wp::mul(x, block[slot]));
-#else
-            const SCALAR* m = block[slot].data[0];
-            SCALAR* of = y.data[j[slot]].c;
-            row its = {of[0], of[1], of[2], SCALAR(0)};
-            its -= *(const row*)m * x.c[0];
-            its -= *(const row*)(m + 3) * x.c[1];
-            its -= *(const row*)(m + 6) * x.c[2];
+        const int j = neighbour.data[stencil * i + slot];
+        if (j >= 0) {
+            const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+            SCALAR* of = y.data[j].c;
+            row its = {of[0], of[1], of[2], 0};
+            its = its - *(const row*)m * x.c[0];
+            its = its - *(const row*)(m + 3) * x.c[1];
+            its = its - *(const row*)(m + 6) * x.c[2];
             of[0] = its[0];
             of[1] = its[1];
             of[2] = its[2];
-#endif
         }
     }
 """
-)
 
 
 @functools.cache
@@ -95,9 +69,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
         return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
 
-    number = "double" if scalar is wp.float64 else "float"
-
-    @wp.func_native(_GATHER.replace("SCALAR", number))
+    @wp.func_native(access.rows(variant, _GATHER))
     def gather_positions(
         i: int,
         stencil: int,
@@ -106,7 +78,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         x: wp.array(dtype=vec3),
     ) -> vec3: ...
 
-    @wp.func_native(_SPREAD.replace("SCALAR", number))
+    @wp.func_native(access.rows(variant, _SPREAD))
     def spread_positions(
         i: int,
         stencil: int,
