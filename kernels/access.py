@@ -3,8 +3,8 @@
 Warp's own ``array[i]`` loads a stride, multiplies by it, and asks whether i counts from the end: on the CPU as much
 work as the product of a 3 × 3 block. Through these the solver's iteration takes three quarters of the time. No adjoint.
 
-And rows of blocks as vectors of the machine, for functions in C++ (``rows``): from three numbers, or loops over four, the
-compiler makes twice the instructions.
+And rows of blocks as vectors of the machine, for functions in C++ (``rows``): from three numbers, or loops over four,
+the compiler makes twice the instructions.
 """
 
 import functools

@@ -18,7 +18,6 @@ import warp as wp
 from . import access
 from .variant import Variant
 
-
 _CORRECT = """
     for (int slot = 0; slot < stencil; ++slot) {
         const int j = neighbour.data[stencil * i + slot];

@@ -24,7 +24,6 @@ from . import access
 from .step import NOT_CONVERGED, NOT_FINITE
 from .variant import Variant
 
-
 _GATHER = """
     row a = {}, b = {}, c = {};
     for (int slot = stencil - 1; slot >= 0; --slot) {
