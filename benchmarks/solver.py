@@ -38,6 +38,7 @@ WARM_UP = 50
 RUN = 20
 """Steps in a measured run, over which the costs of its beginning are spread."""
 
+SIZES = [5, 9, 17, 25, 33]
 METHOD = {"step": paper.STEP, "integrator": "linear"}
 
 
@@ -158,7 +159,7 @@ def benchmark(size: int, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[5, 9, 17, 25, 33], help="rows and columns (%(default)s)")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="rows and columns (%(default)s)")
     parser.add_argument("--repeats", type=int, default=15, help="timed runs (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "solver.csv", help="CSV file (%(default)s)")
     options = parser.parse_args()
