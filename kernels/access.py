@@ -34,12 +34,13 @@ _ROWS = """
 
 
 def rows(variant: Variant, snippet: str) -> str:
-    """A function's C++ with the variant's type in place of SCALAR and vectors of four of them, ``row``.
+    """A function's C++ with the variant's scalar in place of SCALAR, 1 or 0 in place of SLIDING, and a ``row`` of four.
 
     The row of a 3 × 3 block has three: the fourth is the next number in memory, and counts for nothing. Behind every
-    block of ``upper_xx`` with a neighbour stands another, for the last node has no upper neighbour.
+    block with a neighbour stands another, for the last node has no upper neighbour.
     """
-    return (_ROWS + snippet).replace("SCALAR", "double" if variant.scalar is wp.float64 else "float")
+    snippet = (_ROWS + snippet).replace("SCALAR", "double" if variant.scalar is wp.float64 else "float")
+    return snippet.replace("SLIDING", str(int(variant.sliding)))
 
 
 @functools.cache
