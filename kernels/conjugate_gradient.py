@@ -9,7 +9,7 @@ the two triangular solves that the preconditioner takes anyway. Here:
 
 Of q, row i has given the rows behind it its part of Uᵀ (t − E⁻¹q) when they come to their turn. Both sweeps do all that
 there is to do with a node's vectors while they are at hand, and of the diagonal blocks the iteration reads D once and
-E⁻¹ twice, E never. They count their columns by hand: the object that Warp makes of a range costs a third of a block.
+E⁻¹ twice, E never. They count their columns by hand: the object that Warp makes of a range costs 3 % of a step.
 
 ``team.py`` tells how processor cores share the sweeps.
 """
