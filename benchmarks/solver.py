@@ -1,10 +1,11 @@
 """A full step against one SciPy solve of its linear system, on the paper's hung cloth, all terms, double precision.
 
-    python benchmarks/solver.py [--sizes 5 9 17 33] [--repeats 15]
+    python benchmarks/solver.py [--sizes 5 9 17 25 33] [--repeats 15]
 
 One core. "step" is everything a step costs: forces, matrix, contact, solve, update, and copying the frame out, as the
-mean of consecutive steps of Simulator.run, replayed from a captured graph. "scipy" is scipy.sparse.linalg.cg alone on
-the system of the first of these steps, a CSR matrix made beforehand.
+mean of consecutive steps of Simulator.run, replayed from a captured graph. "locked" is the same of the cloth without
+sliding, which goes its own way from rest. "scipy" is scipy.sparse.linalg.cg alone on the system of the first of these
+steps, a CSR matrix made beforehand. All of them take turns.
 
 SciPy's cg stops at ‖r‖ ≤ tolerance ‖b‖, ours at √(r·P⁻¹r) ≤ tolerance √(b·P⁻¹b) with its preconditioner P. So SciPy
 gets the system scaled by its diagonal D: D^-½ A D^-½ y = D^-½ b, y = D^½ q̇. Plain cg on it makes the iterates of
@@ -36,6 +37,9 @@ WARM_UP = 50
 
 RUN = 20
 """Steps in a measured run, over which the costs of its beginning are spread."""
+
+SIZES = [5, 9, 17, 25, 33]
+METHOD = {"step": paper.STEP, "integrator": "linear"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,8 +103,7 @@ def velocities(simulator: wy.Simulator) -> np.ndarray:
 def simulators(size: int) -> dict[str, wy.Simulator]:
     """One for each of our preconditioners, on the same moving cloth."""
     scene = paper.hung_cloth(rows=size, columns=size)
-    options = {"step": paper.STEP, "integrator": "linear"}
-    result = {name: wy.Simulator(scene, preconditioner=name, **options) for name in ("incomplete", "jacobi")}
+    result = {name: wy.Simulator(scene, preconditioner=name, **METHOD) for name in ("incomplete", "jacobi")}
     result["incomplete"].run(WARM_UP)
     result["jacobi"].state = result["incomplete"].state
     return result
@@ -124,9 +127,13 @@ def benchmark(size: int, repeats: int) -> dict[str, Any]:
     """One row of the table."""
     ours = simulators(size)
     scaled = Scaled.of(ours["jacobi"])
+    locked = wy.Simulator(paper.hung_cloth(rows=size, columns=size, sliding=False), **METHOD)
+    locked.run(WARM_UP)
     start = ours["jacobi"].state
 
     def step(simulator: wy.Simulator) -> Callable[[], float]:
+        start = simulator.state
+
         def run() -> float:
             simulator.state = start
             begin = time.perf_counter()
@@ -138,7 +145,7 @@ def benchmark(size: int, repeats: int) -> dict[str, Any]:
     def solve() -> None:
         scipy.sparse.linalg.cg(scaled.matrix, scaled.rhs, scaled.start, rtol=ours["jacobi"].model.tolerance)
 
-    timings = measure([*map(step, ours.values()), solve], repeats)
+    without, *timings = measure([*map(step, (locked, *ours.values())), solve], repeats)
     for simulator in ours.values():
         simulator.state = start
     row: dict[str, Any] = {"size": f"{size} × {size}", "unknowns": len(scaled.rhs)}
@@ -146,12 +153,13 @@ def benchmark(size: int, repeats: int) -> dict[str, Any]:
     for name, timing, facts in zip(names, timings, compare(ours).values(), strict=True):
         row |= {**timing.columns(name), f"{name} iterations": facts["iterations"], f"{name} error": facts["error"]}
     row["scipy / step"] = timings[-1].median / timings[0].median
+    row |= {**without.columns("locked"), "locked / step": without.median / timings[0].median}
     return row
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[5, 9, 17, 33], help="rows and columns (%(default)s)")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="rows and columns (%(default)s)")
     parser.add_argument("--repeats", type=int, default=15, help="timed runs (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "solver.csv", help="CSV file (%(default)s)")
     options = parser.parse_args()
@@ -161,7 +169,7 @@ def main() -> None:
     rows = [benchmark(size, options.repeats) for size in options.sizes]
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     print(f"medians of {options.repeats} runs; IQR: interquartile range")
-    for columns in (("step, incomplete",), ("step, jacobi",), ("scipy",)):
+    for columns in (("step, incomplete", "locked"), ("step, jacobi",), ("scipy",)):
         shown = [
             {key: value for key, value in row.items() if key in ("size", "unknowns") or key.startswith(columns)}
             for row in rows

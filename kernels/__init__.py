@@ -55,6 +55,8 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
+    # but not the contact: nodes on one line have products that cancel to the last digit
+    variant.fuse("terms")
     kernels = {"contact_normal": contact.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
     for term in TERMS.values():
         kernels[term.name] = term.define(variant)

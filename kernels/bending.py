@@ -104,11 +104,13 @@ def define(variant: Variant) -> wp.Kernel:
         l2 = wp.length(e2)
         s1 = presence(l1, unit)
         s2 = presence(l2, unit)
-        t1 = wp.normalize(e1)
-        t2 = wp.normalize(e2)
+        by_l1 = inverse_length(l1, unit)
+        by_l2 = inverse_length(l2, unit)
+        t1 = e1 * by_l1
+        t2 = e2 * by_l2
         angle = bend_angle(t1, t2)
-        f1 = bend_force(t1, t2, inverse_length(l1, unit), s1, s2, k, angle[0], angle[1])
-        f2 = bend_force(t2, t1, inverse_length(l2, unit), s2, s1, k, angle[0], angle[1])
+        f1 = bend_force(t1, t2, by_l1, s1, s2, k, angle[0], angle[1])
+        f2 = bend_force(t2, t1, by_l2, s2, s1, k, angle[0], angle[1])
         return f1, f2
 
     @wp.func

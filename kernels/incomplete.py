@@ -18,6 +18,28 @@ import warp as wp
 from . import access
 from .variant import Variant
 
+_CORRECT = """
+    for (int slot = 0; slot < stencil; ++slot) {
+        const int j = neighbour.data[stencil * i + slot];
+        if (j >= 0) {
+            const SCALAR* b = upper_xx.data[stencil * i + slot].data[0];
+            const row b0 = *(const row*)b, b1 = *(const row*)(b + 3), b2 = *(const row*)(b + 6);
+            const row x = b0 * m.c[0] + b1 * m.c[1] + b2 * m.c[2];
+            const row y = b0 * m.c[1] + b1 * m.c[3] + b2 * m.c[4];
+            const row z = b0 * m.c[2] + b1 * m.c[4] + b2 * m.c[5];
+            const row first = x * b[0] + y * b[3] + z * b[6];
+            const row second = x * b[1] + y * b[4] + z * b[7];
+            SCALAR* e = pivot.data[j].c;
+            e[0] -= first[0];
+            e[1] -= first[1];
+            e[2] -= first[2];
+            e[3] -= second[1];
+            e[4] -= second[2];
+            e[5] -= x[2] * b[2] + y[2] * b[5] + z[2] * b[8];
+        }
+    }
+"""
+
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
@@ -36,17 +58,13 @@ def functions(variant: Variant) -> SimpleNamespace:
             m[2] * x[0] + m[4] * x[1] + m[5] * x[2],
         )
 
-    @wp.func
-    def congruent(m: sym33, b: mat33) -> sym33:
-        """bᵀ m b."""
-        x = vec3(b[0, 0], b[1, 0], b[2, 0])
-        y = vec3(b[0, 1], b[1, 1], b[2, 1])
-        z = vec3(b[0, 2], b[1, 2], b[2, 2])
-        m_y = product(m, y)
-        m_z = product(m, z)
-        return sym33(
-            wp.dot(x, product(m, x)), wp.dot(x, m_y), wp.dot(x, m_z), wp.dot(y, m_y), wp.dot(y, m_z), wp.dot(z, m_z)
-        )
+    @wp.func_native(access.rows(variant, _CORRECT))
+    def correct(
+        m: sym33, i: int, stencil: int, neighbour: wp.array(dtype=int), upper_xx: wp.array(dtype=mat33),
+        pivot: wp.array(dtype=sym33),
+    ):  # fmt: skip
+        """pivot −= bᵀ m b of the neighbours of a node, b its blocks."""
+        ...
 
     @wp.func
     def inverse_of(m: sym33) -> sym33:
@@ -64,14 +82,14 @@ def functions(variant: Variant) -> SimpleNamespace:
             return sym33(c00 * f, c01 * f, c02 * f, c11 * f, c12 * f, c22 * f)
         return sym33()
 
-    return SimpleNamespace(symmetric=symmetric, product=product, congruent=congruent, inverse_of=inverse_of)
+    return SimpleNamespace(symmetric=symmetric, product=product, correct=correct, inverse_of=inverse_of)
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, mat33, sym33 = variant.scalar, variant.mat33, variant.sym33
     at, put = access.functions(variant).at, access.functions(variant).put
-    symmetric, congruent = functions(variant).symmetric, functions(variant).congruent
+    symmetric, correct = functions(variant).symmetric, functions(variant).correct
     inverse_of = functions(variant).inverse_of
     variant.fuse("incomplete")
 
@@ -99,12 +117,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 if inverse[0] <= scalar(0.0):
                     # What was dropped made it indefinite: any positive definite E will do, so take the block itself.
                     inverse = symmetric(wp.inverse(diagonal_xx[i]))
-                for slot in range(6):
-                    if slot < stencil:
-                        k = stencil * i + slot
-                        j = at(neighbour, k)
-                        if j >= 0:
-                            put(inverse_pivot, j, at(inverse_pivot, j) - congruent(inverse, at(upper_xx, k)))
+                correct(inverse, i, stencil, neighbour, upper_xx, inverse_pivot)
             put(inverse_pivot, i, inverse)
 
     return SimpleNamespace(factorize=factorize)

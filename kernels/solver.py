@@ -24,17 +24,102 @@ from . import access
 from .step import NOT_CONVERGED, NOT_FINITE
 from .variant import Variant
 
+_GATHER = """
+    row a = {}, b = {}, c = {}, x_s = {}, u_x = {}, v_x = {};
+    SCALAR u_s = 0, v_s = 0;
+    auto add = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
+        const int j = neighbour.data[stencil * i + slot];
+        if (j < 0)
+            return;
+        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+        const SCALAR* of = x.data[j].c;
+        const row its = {of[0], of[1], of[2], 0};
+        a = a + *(const row*)m * its;
+        b = b + *(const row*)(m + 3) * its;
+        c = c + *(const row*)(m + 6) * its;
+#if SLIDING
+        if (slot < 4) {
+            const int k = 4 * i + slot;
+            const SCALAR along = s.data[2 * j + direction];
+            x_s = x_s + *(const row*)upper_xs.data[k].c * along;
+            s_x = s_x + *(const row*)upper_sx.data[k].c * its;
+            s_s += upper_ss.data[k] * along;
+        }
+#endif
+    };
+    for (int slot = stencil - 1; slot >= 0; --slot) {
+        add(slot, 1, v_x, v_s);
+#if SLIDING
+        add(--slot, 0, u_x, u_s);
+#endif
+    }
+    wp::vec_t<5, SCALAR> y;
+    y.c[0] = a[0] + a[1] + a[2];
+    y.c[1] = b[0] + b[1] + b[2];
+    y.c[2] = c[0] + c[1] + c[2];
+#if SLIDING
+    for (int k = 0; k < 3; ++k)
+        y.c[k] += x_s[k];
+    y.c[3] = u_x[0] + u_x[1] + u_x[2] + u_s;
+    y.c[4] = v_x[0] + v_x[1] + v_x[2] + v_s;
+#endif
+    return y;
+"""
+_SPREAD = """
+    auto take = [&](int slot, int direction, SCALAR along) {
+        const int j = neighbour.data[stencil * i + slot];
+        if (j < 0)
+            return;
+        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+        SCALAR* of = y_x.data[j].c;
+        row its = {of[0], of[1], of[2], 0};
+        its = its - *(const row*)m * x.c[0];
+        its = its - *(const row*)(m + 3) * x.c[1];
+        its = its - *(const row*)(m + 6) * x.c[2];
+#if SLIDING
+        if (slot < 4) {
+            const int k = 4 * i + slot;
+            its = its - *(const row*)upper_sx.data[k].c * along;
+            y_s.data[2 * j + direction] -= wp::dot(upper_xs.data[k], x) + upper_ss.data[k] * along;
+        }
+#endif
+        of[0] = its[0];
+        of[1] = its[1];
+        of[2] = its[2];
+    };
+    for (int slot = 0; slot < stencil; ++slot) {
+        take(slot, 0, u);
+#if SLIDING
+        take(++slot, 1, v);
+#endif
+    }
+"""
+
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
     """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    vec5 = wp.types.vector(5, scalar)
     at, put = access.functions(variant).at, access.functions(variant).put
 
     @wp.func
     def times(m: mat33, x: vec3) -> vec3:
         """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
         return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
+
+    @wp.func_native(access.rows(variant, _GATHER))
+    def gather_together(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+        s: wp.array(dtype=scalar),
+    ) -> vec5: ...
 
     @wp.func
     def gather(
@@ -49,30 +134,10 @@ def functions(variant: Variant) -> SimpleNamespace:
         s: wp.array(dtype=scalar),
     ):
         """Row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
-        y = vec3()
-        y_u = scalar(0.0)
-        y_v = scalar(0.0)
-        for turn in range(6):
-            slot = 5 - turn
-            if slot < stencil:
-                k = stencil * i + slot
-                j = at(neighbour, k)
-                if j >= 0:
-                    its = at(x, j)
-                    y += times(at(upper_xx, k), its)
-                    if wp.static(sliding):
-                        if slot < 4:
-                            e = 4 * i + slot
-                            along = at(s, 2 * j + slot % 2)
-                            y += at(upper_xs, e) * along
-                            row = wp.dot(at(upper_sx, e), its) + at(upper_ss, e) * along
-                            if slot % 2 == 0:
-                                y_u += row
-                            else:
-                                y_v += row
-        return y, y_u, y_v
+        y = gather_together(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, x, s)
+        return vec3(y[0], y[1], y[2]), y[3], y[4]
 
-    @wp.func
+    @wp.func_native(access.rows(variant, _SPREAD))
     def spread(
         i: int,
         stencil: int,
@@ -88,22 +153,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         y_s: wp.array(dtype=scalar),
     ):
         """y −= Uᵀ (x, u, v), what row i of U gives to others."""
-        for slot in range(6):
-            if slot < stencil:
-                k = stencil * i + slot
-                j = at(neighbour, k)
-                if j >= 0:
-                    y = at(y_x, j) - x * at(upper_xx, k)
-                    if wp.static(sliding):
-                        if slot < 4:
-                            e = 4 * i + slot
-                            mine = u
-                            if slot % 2 == 1:
-                                mine = v
-                            y -= at(upper_sx, e) * mine
-                            its = 2 * j + slot % 2
-                            put(y_s, its, at(y_s, its) - wp.dot(at(upper_xs, e), x) - at(upper_ss, e) * mine)
-                    put(y_x, j, y)
+        ...
 
     @wp.func
     def multiply(

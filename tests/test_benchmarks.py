@@ -54,6 +54,7 @@ def test_a_row_reaches_the_csv_file_with_the_environment(tmp_path):
     # 9 nodes of 3 unknowns, one crossing of 2
     assert read["unknowns"] == "29"
     assert float(read["scipy [ms]"]) > 0.0
+    assert float(read["locked [ms]"]) > 0.0
     assert {"processor", "warp-lang", "scipy", "revision"} <= set(read)
 
 
