@@ -11,6 +11,7 @@ import torch
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
+from warp_yarn import arrays
 
 YARNS = [wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4), wy.Yarn(density=2.5e-3, stretch=1.7e5, bend=1.1e-4)]
 WIND = wy.Wind(velocity=(0.3, 5.0, -0.2))
@@ -260,6 +261,20 @@ def test_run_is_the_simulator_s() -> None:
     trajectory = wy.Simulator(scene, **tolerances).run(70)
     assert np.array_equal(frames.position.numpy(), trajectory.position)
     assert np.array_equal(frames.euler.numpy(), trajectory.euler)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("method", ["linear", "sdirk2"])
+def test_large_arrays_are_cleared_beside_the_tape(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    """By a kernel of ours, where small ones are by Warp: the gradient is the same, and Warp has nothing to warn of."""
+    gradients = []
+    for least in (1 << 40, 64):
+        monkeypatch.setattr(arrays, "LARGE", least)
+        rollout = wt.Rollout(scene_for("plain", 2), 2, integrator=method)
+        shear = rollout.defaults["shear"].clone().requires_grad_()
+        rollout(shear=shear).position[-1].square().sum().backward()
+        gradients.append(shear.grad)
+    assert torch.equal(*gradients) and gradients[0].abs().min() > 0.0
 
 
 def test_two_runs_in_one_loss() -> None:

@@ -188,7 +188,9 @@ class Arrays(dict[str, Any]):
             array.zero_()
         else:
             kind = {self.variant.vec3: "vectors", self.variant.mat33: "matrices"}.get(array.dtype, "numbers")
-            self.launch(build(self.variant)[f"clear_{kind}"], array.shape[0], array=array)
+            clear = build(self.variant)[f"clear_{kind}"]
+            # as zero_, no part of a tape
+            wp.launch(clear, dim=array.shape[0], inputs=[array], device=self.device, record_tape=False)
 
     def launch(self, kernel: wp.Kernel, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel over elements, its arguments found by their names."""
