@@ -104,6 +104,15 @@ def test_parts_that_cannot_be_made_are_halved() -> None:
     assert simulator.parts.tried <= 0.3 and simulator.parts.rejected >= 2
 
 
+def test_an_error_that_no_part_keeps_to_ends_the_run() -> None:
+    simulator = hung(1e-3, step_error=1e-30)
+    with pytest.raises(
+        wy.SimulationError, match=r"step 1 .* its error stays above step_error = 1e-30: allow more"
+    ) as end:
+        simulator.run(2)
+    assert len(end.value.trajectory) == 1 and simulator.steps_done == 0
+
+
 @pytest.mark.parametrize("method", [name for name in INTEGRATORS if name != "sdirk2"])
 def test_methods_without_an_estimate_are_refused(method: str) -> None:
     with pytest.raises(wy.InputError, match=rf"step_error with integrator = '{method}': only 'sdirk2' estimates"):

@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from .arrays import STATE_TYPES
+from .kernels.step import INACCURATE
 from .model import Model
 
 SMALLEST = 2.0**-7
@@ -84,6 +85,8 @@ class Parts:
         ratio = self.error() / self.allowed
         factor = MOST_GROWTH if ratio == 0.0 else SAFETY * ratio ** (-1.0 / (self.method.order + 1))
         self.size = size * min(MOST_GROWTH, max(MOST_SHRINKAGE, factor))
+        if ratio > 1.0:
+            self.model.arrays.put("status", INACCURATE, -1, 0)
         return ratio <= 1.0
 
     def error(self) -> float:

@@ -288,6 +288,7 @@ class Simulator:
                 f"Newton's iteration stopped at a residual of {residual:.1e}, "
                 f"above its tolerance of {self.model.newton_tolerance_at(smallest):.1e}"
             ),
+            step.INACCURATE: f"its error stays above step_error = {self.step_error}: allow more",
         }[code]
         raise SimulationError(
             f"{where} {what}. The largest term {'there ' if node >= 0 else ''}is {term!r}. "
