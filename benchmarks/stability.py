@@ -26,6 +26,7 @@ import warp as wp
 from common import RESULTS, environment, one_core, write_csv
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 import warp_yarn as wy
@@ -37,6 +38,8 @@ DURATION = 1.0 / 15.0
 COUNTS = (666, 200, 66, 20, 6, 2)
 """Steps of each run: from 1e-4 to 1/30 s."""
 FINEST = 2000
+LARGE = 50
+"""Rows from which on a cloth takes too long for short steps, and for the reference."""
 STRETCH = (1e-2, 1e-1, 1.0, 1e1, 1e2)
 ACCURATE, FAR = 0.05, 3.0
 VERDICTS = ("accurate", "stable, damped", "broken")
@@ -63,7 +66,7 @@ class Case:
 
     def counts(self) -> tuple[int, ...]:
         """Of steps; large cloths at the longer steps alone."""
-        return COUNTS if self.size < 30 else COUNTS[3:]
+        return COUNTS if self.size < LARGE else COUNTS[3:]
 
     def label(self) -> str:
         """What sets it apart from the paper's."""
@@ -105,7 +108,7 @@ def end(case: Case, method: str, count: int) -> tuple[np.ndarray, float]:
 @functools.cache
 def converged(case: Case) -> tuple[np.ndarray, float] | None:
     """None where the method that makes it does not get through, or would take too long."""
-    if case.size > 20:
+    if case.size >= LARGE:
         return None
     try:
         return end(dataclasses.replace(case, precision="double"), "sdirk2", FINEST)
@@ -187,7 +190,9 @@ def draw(path: Path, rows: list[dict[str, Any]], maps: tuple[Case, ...], others:
     legend = [Patch(color=color, label=verdict) for verdict, color in zip(VERDICTS, COLORS, strict=True)]
     line = axes[0, 0].lines[0]
     line.set_label("an explicit method's limit, yarns locked")
-    figure.legend(handles=[*legend, line], loc="outside lower center", ncols=4, frameon=False)
+    unknown = Line2D([], [], color="k", marker="$?$", linestyle="", label="too large to compare")
+    left_out = Patch(facecolor="white", edgecolor="0.7", label="too large to run")
+    figure.legend(handles=[*legend, line, unknown, left_out], loc="outside lower center", ncols=6, frameon=False)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
 
@@ -199,7 +204,7 @@ def panel(axis: Any, table: list[list[dict[str, Any] | None]]) -> None:
     for j, line in enumerate(table):
         for i, row in enumerate(line):
             if row is not None:
-                text = row["cause"] or (f"{100.0 * row['error']:.2g} %" if row["error"] != "" else "")
+                text = row["cause"] or (f"{100.0 * row['error']:.2g} %" if row["error"] != "" else "?")
                 axis.text(i, j, text, ha="center", va="center", fontsize=7)
 
 
