@@ -37,7 +37,8 @@ class Simulator:
         tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-6,
             and 1e-8 where differentiable; in single precision 1e-4. In implicit stages it is that of the adjoint's
             solves alone.
-        newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms; None: 3e-4
+        newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms, found or
+            expected of its last iteration (``CAUTION`` in ``kernels/stage.py``); None: 3e-4
             (less where the step resolves the yarns' stretching, as its square), and 1e-8 where differentiable; in
             single precision 3e-4.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
