@@ -179,7 +179,7 @@ def define(variant: Variant) -> SimpleNamespace:
         residual: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """Whether Newton's iteration ends at w, goes on from it, or takes back half of the way to it.
+        """Whether Newton's iteration ends at w, or with one step more, goes on, or takes back half of the way to w.
 
         ‖r‖ is in the norm of A's inverse diagonal and ‖w‖ in that of its diagonal: both are √(energy).
         """
