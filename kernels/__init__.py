@@ -24,6 +24,7 @@ from . import (
     shear,
     solver,
     stage,
+    stage_adjoint,
     step,
     stretch,
     wind,
@@ -64,6 +65,6 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     for part in (step, ros2):
         kernels |= vars(part.define_reversible(variant))
-    for part in (step, solver, incomplete, conjugate_gradient, history, adjoint, stage, ros2):
+    for part in (step, solver, incomplete, conjugate_gradient, history, adjoint, stage, stage_adjoint, ros2):
         kernels |= vars(part.define(variant.forward))
     return kernels
