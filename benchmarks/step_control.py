@@ -11,6 +11,8 @@ logarithms of the two nearest, from the same turn: its median.
 from __future__ import annotations
 
 import argparse
+import functools
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,15 +34,16 @@ FIRST_PART = 1e-3
 """[s]"""
 
 
-def beginning(simulator: wy.Simulator, duration: float) -> Callable[[], None]:
-    """What takes a simulator back to its beginning."""
-    start = simulator.state
+def made(simulator: wy.Simulator, count: int) -> Callable[[], np.ndarray]:
+    """A function that makes all of a motion from its beginning, and returns where it ends."""
+    start, parts = simulator.state, simulator.parts
 
-    def restart() -> None:
+    def run() -> np.ndarray:
         simulator.state, simulator.steps_done = start, 0
-        simulator.parts.size, simulator.parts.made, simulator.parts.rejected = FIRST_PART / duration, 0, 0
+        parts.size, parts.made, parts.rejected = FIRST_PART / simulator.step_size, 0, 0
+        return end(simulator, count)
 
-    return restart
+    return run
 
 
 def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, Any]]:
@@ -50,25 +53,20 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
         runs.append((motion.simulator(size, step=motion.duration / count), count))
     for allowed in STEP_ERRORS:
         runs.append((motion.simulator(size, step=motion.duration, step_error=allowed), 1))
-    for simulator, count in runs:
-        restart = beginning(simulator, motion.duration)
-        restart()
+    makes = [made(*run) for run in runs]
+    for (simulator, count), make in zip(runs, makes, strict=True):
         row = {"motion": name, "size": f"{size} × {size}", "step error": simulator.step_error or "even"}
-        row["error"] = converged.error(end(simulator, count))
+        row["error"] = converged.error(make())
         parts = simulator.parts
         row |= {"steps": count, "rejected": 0} if count > 1 else {"steps": parts.made, "rejected": parts.rejected}
         result.append(row)
 
-    def timed(simulator: wy.Simulator, count: int) -> Callable[[], None]:
-        restart = beginning(simulator, motion.duration)
+    def timed(make: Callable[[], np.ndarray]) -> float:
+        begin = time.perf_counter()
+        make()
+        return time.perf_counter() - begin
 
-        def run() -> None:
-            restart()
-            end(simulator, count)
-
-        return run
-
-    seconds = np.array(turns([timed(*run) for run in runs], repeats)) / motion.duration
+    seconds = np.array(turns([functools.partial(timed, make) for make in makes], repeats)) / motion.duration
     even = len(COUNTS)
     log_errors = np.log([row["error"] for row in result])
     for k, row in enumerate(result):

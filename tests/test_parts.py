@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from test_gradients import cloth
+from test_integrators import fails_at_first
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
@@ -92,14 +93,7 @@ def test_parts_add_up_to_the_step() -> None:
 
 def test_parts_that_cannot_be_made_are_halved() -> None:
     simulator = wy.Simulator(wy.Scene(cloth(4, 4), wind=wy.Wind(velocity=(0.0, 5.0, 0.0))), step_error=1e9)
-    advance, arrays = simulator.integrator.advance, simulator.arrays
-
-    def attempt() -> None:
-        if arrays["step_size"].numpy()[0] > 3e-4:
-            arrays["status"].assign(np.array([wy.kernels.step.STALLED, -1, 0], dtype=np.int32))
-        advance()
-
-    simulator.integrator.advance = attempt
+    fails_at_first(simulator, 3e-4)
     assert len(simulator.run(1)) == 2
     assert simulator.parts.tried <= 0.3 and simulator.parts.rejected >= 2
 
