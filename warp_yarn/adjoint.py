@@ -72,7 +72,7 @@ class Adjoint:
             GradientError: where an adjoint is not finite, or its solve does not converge.
         """
         a = self.arrays
-        a["counters"].assign(np.array([steps, first + steps], dtype=np.int32))
+        a.put("counters", steps, first + steps)
         with self.simulator.model.team():
             for k in range(steps, 0, -1):
                 self.simulator.integrator.retreat()
@@ -81,7 +81,7 @@ class Adjoint:
 
     def finish(self) -> None:
         """Takes in what the loss asks of the first frame; the running adjoints are then those of the initial state."""
-        self.arrays["counters"].assign(np.zeros(2, dtype=np.int32))
+        self.arrays.zero("counters")
         self._receive()
         for name in self.wanted:
             array = self.arrays[name]

@@ -6,11 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import warp as wp
-
 from .arrays import STATE_TYPES
 from .kernels.step import INACCURATE
-from .model import Model
+from .model import Graphs, Model
 
 SMALLEST = 2.0**-7
 """Of a step, where a part is halved because it cannot be made."""
@@ -41,7 +39,7 @@ class Parts:
         self.model, self.method, self.allowed = model, method, allowed
         self.size = self.tried = 1.0
         self.made = self.rejected = 0
-        self._graphs: dict[str, Any] = {}
+        self._graphs = Graphs(model.device)
 
     def make(self, count: Callable[[], None]) -> float:
         """Makes a step from the present state.
@@ -100,8 +98,4 @@ class Parts:
         if "kept_position" not in a:
             for name in moving:
                 a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)
-        if target not in self._graphs:
-            with wp.ScopedCapture(device=model.device, force_module_load=False) as capture:
-                model.copy(**{target + name: source + name for name in moving})
-            self._graphs[target] = capture.graph
-        wp.capture_launch(self._graphs[target])
+        self._graphs.run(target, lambda: model.copy(**{target + name: source + name for name in moving}))

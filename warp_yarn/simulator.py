@@ -206,10 +206,10 @@ class Simulator:
             self.parts.size = 0.5
         smallest = self.parts.make(lambda: self._count(frame))
         self.integrator.set_times(self.step_size, self.step_size)
-        if smallest and self.step_error is None:
-            self.split_steps[self.steps_done + frame + 1] = smallest * self.step_size
         if smallest:
             self._count(frame + 1)
+            if self.step_error is None:
+                self.split_steps[self.steps_done + frame + 1] = smallest * self.step_size
         return smallest > 0.0
 
     def run(self, steps: int, *, progress: bool = False) -> Trajectory:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import warp as wp
 
-from ..model import BETWEEN, MATRIX, Model
+from ..model import BETWEEN, MATRIX, Graphs, Model
 
 
 class LinearlyImplicitEuler:
@@ -23,20 +22,15 @@ class LinearlyImplicitEuler:
 
     def __init__(self, model: Model):
         self.model = model
-        self._forward: Any = None
-        self._backward: Any = None
+        self._graphs = Graphs(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
         self.model.set_times(step, remaining, step)
 
     def advance(self) -> None:
-        """Makes a step, and records it. Captured at the first call: replayed, its twenty launches cost microseconds."""
-        if self._forward is None:
-            with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
-                self._step()
-            self._forward = capture.graph
-        wp.capture_launch(self._forward)
+        """Makes a step, and records it."""
+        self._graphs.run("forward", self._step)
 
     def _step(self) -> None:
         model = self.model
@@ -71,7 +65,7 @@ class LinearlyImplicitEuler:
         with self.anchor_tape:
             model.drag_anchor("euler_next", "anchor_next")
         self._around = before, after
-        self._backward = None
+        self._graphs.pop("backward", None)
 
     def _record(self) -> None:
         self.model.assemble()
@@ -83,14 +77,13 @@ class LinearlyImplicitEuler:
         Before, the gradients of the state's arrays hold the adjoint of the step's end; after, that of its beginning,
         and those of parameters have gained the step's part.
         """
-        if self._backward is None:
-            with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
-                before, after = self._around
-                before()
-                self._reverse()
-                after()
-            self._backward = capture.graph
-        wp.capture_launch(self._backward)
+        self._graphs.run("backward", self._retreat)
+
+    def _retreat(self) -> None:
+        before, after = self._around
+        before()
+        self._reverse()
+        after()
 
     def _reverse(self) -> None:
         self._recall()

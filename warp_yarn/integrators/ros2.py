@@ -43,7 +43,6 @@ class ROS2(LinearlyImplicitEuler):
 
     name = "ros2"
     order = 2
-    local_error = None
 
     def __init__(self, model: Model):
         super().__init__(model)

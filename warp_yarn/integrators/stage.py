@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from ..kernels.step import STALLED
-from ..model import BETWEEN, Model
+from ..model import BETWEEN, Graphs, Model
 
 STATE = ("position", "euler", "velocity", "euler_velocity")
 MOVED = (*STATE, "increment", "euler_increment")
@@ -58,15 +57,15 @@ class StageMethod:
             a[name] = a.zeros(1, scalar)
         for name in ("tries", "continues", "finishes", "solves", "refreshes", "crosses", "newton_iterations"):
             a[name] = a.zeros(1, wp.int32)
-        for name in ("stage_size", "carried_time"):
+        for name in ("stage_size", "carried_time", "newton_tolerance"):
             a[name] = a.zeros(1, scalar)
         rate = self.carried / self.fraction
         numbers = {"carried_rate": rate, "unit": 1.0, "step_length": 1.0, "shortest": 1e30}
-        numbers |= {"newton_tolerance": 1.0, "inner_tolerance": INNER_TOLERANCE}
+        numbers["inner_tolerance"] = INNER_TOLERANCE
         for name, value in numbers.items():
             a[name] = a.numbers(value)
         self.set_times(model.step_size, model.step_size)
-        self._graphs: dict[str, Any] = {}
+        self._graphs = Graphs(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
@@ -79,13 +78,8 @@ class StageMethod:
     # -- graphs ------------------------------------------------------------------------------------------------------
 
     def _run(self, part: Callable[[], None]) -> None:
-        """Launches a part of the step, captured at its first call."""
-        name = part.__name__
-        if name not in self._graphs:
-            with wp.ScopedCapture(device=self.model.device, force_module_load=False) as capture:
-                part()
-            self._graphs[name] = capture.graph
-        wp.capture_launch(self._graphs[name])
+        """Launches a part of the step."""
+        self._graphs.run(part.__name__, part)
 
     # -- forward -----------------------------------------------------------------------------------------------------
 
@@ -95,15 +89,16 @@ class StageMethod:
 
     def _step(self) -> None:
         model = self.model
+        estimates = "predicted" in model.arrays
         self._begin()
         for stage in range(self.stages):
             if stage:
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
-                if "predicted" in model.arrays:
+                if estimates:
                     model.copy(predicted="solution")
             self._newton(first=stage == 0)
-        if "predicted" in model.arrays:
+        if estimates:
             model.launch("estimate_error", 1)
         if self._is_carried:
             model.launch("next_base", "nodes", start=None)
@@ -123,7 +118,6 @@ class StageMethod:
         a["predicted"] = a.zeros(a["nodes"], a.variant.vec3)
         a["step_error"] = a.zeros(1, a.variant.scalar)
         a["missing"] = a.numbers(self.local_error / (self.fraction * self.carried))
-        self._graphs = {}
 
     @property
     def _is_carried(self) -> bool:
@@ -221,10 +215,14 @@ class StageMethod:
     def _rounding(self) -> float:
         return 1e-16 if self.model.precision == "double" else 1e-7
 
+    @property
+    def _adjoint_tolerance(self) -> float:
+        return max(self.model.tolerance, 10.0 * self._rounding)
+
     def _stall(self, residual: float) -> None:
         a = self.model.arrays
-        a["residual"].fill_(float(residual))
-        a["status"].assign(np.array([STALLED, -1, 0], dtype=np.int32))
+        a.put("residual", residual)
+        a.put("status", STALLED, -1, 0)
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -238,7 +236,7 @@ class StageMethod:
                 a[name] = a.zeros(n, vec3)
                 a[f"euler_{name}"] = a.zeros(2 * n, scalar) if sliding else None
             a["first_size"] = a.zeros(1, scalar)
-            a["adjoint_tolerance"] = a.numbers(max(model.tolerance, 10.0 * self._rounding))
+            a["adjoint_tolerance"] = a.numbers(self._adjoint_tolerance)
         base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
         a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if sliding:
@@ -252,7 +250,8 @@ class StageMethod:
             model.prescribe(position=a["base_position"])
         self._around = before, after
         self._added = self._arrays_added_to()
-        self._graphs = {name: graph for name, graph in self._graphs.items() if name == "_step"}
+        for name in self._graphs.keys() - {"_step"}:
+            del self._graphs[name]
 
     def retreat(self) -> None:
         """As of LinearlyImplicitEuler; (−∂r/∂w)ᵀ λ = w̄ is solved to the linear tolerance, with the exact derivative."""
@@ -316,9 +315,8 @@ class StageMethod:
         a = self.model.arrays
         self._run(self._descend)
         size, first = (float(a[name].numpy()[0]) for name in ("size", "first_size"))
-        wanted = float(a["adjoint_tolerance"].numpy()[0]) * first
-        if not size <= wanted and not a["status"].numpy()[0]:
-            self._minimize(size, wanted)
+        if not size <= self._adjoint_tolerance * first and not a["status"].numpy()[0]:
+            self._minimize(size, first)
         self._run(self._absorb)
 
     def _descend(self) -> None:
@@ -338,8 +336,8 @@ class StageMethod:
         self._gather()
         self.model.launch("judge_adjoint", 1)
 
-    def _minimize(self, first: float, wanted: float) -> None:
-        """What is left of λ, from a ρ of size ``first``, by GMRES with the preconditioner A, to a size ``wanted``.
+    def _minimize(self, left: float, first: float) -> None:
+        """What is left of λ, from a ρ of this size, by GMRES with the preconditioner A; ``first`` was that of ρ₀.
 
         Where yarns slide fast, A alone need not contract.
         """
@@ -349,13 +347,13 @@ class StageMethod:
         kept = {name: a[name].grad.numpy().copy() for name in self._added}
         weight = np.sqrt(self._vector("inverse_x", "inverse_s"))
         basis, parts, columns = [], [], []
-        combination, size = np.zeros(0), first
-        while size > wanted:
+        combination, size = np.zeros(0), left
+        while size > self._adjoint_tolerance * first:
             if len(parts) == MOST_PARTS or not np.isfinite(size) or a["status"].numpy()[0]:
                 self._stall(size / first)
                 return
             if not basis:
-                basis.append(weight * rho / first)
+                basis.append(weight * rho / left)
             self._set_vector("seed", basis[-1] / np.where(weight > 0.0, weight, 1.0))
             self._run(self._solve_part)
             parts.append(self._vector("rhs", gradient=True))
@@ -374,7 +372,7 @@ class StageMethod:
             for k, entries in enumerate(columns):
                 hessenberg[: len(entries), k] = entries
             target = np.zeros(len(columns) + 1)
-            target[0] = first
+            target[0] = left
             combination = np.linalg.lstsq(hessenberg, target, rcond=None)[0]
             size = float(np.linalg.norm(hessenberg @ combination - target))
             if norm == 0.0:
