@@ -46,6 +46,50 @@ def define(variant: Variant) -> SimpleNamespace:
         values_grad[e] = vec3()
 
     @wp.kernel(module=module, enable_backward=False)
+    def move_along(
+        counters: wp.array(dtype=int),
+        stage: int,
+        stage_times: wp.array(dtype=scalar),
+        start: wp.array(dtype=vec3),
+        path: wp.array(dtype=vec3),
+        values: wp.array(dtype=vec3),
+        motion: wp.array(dtype=vec3),
+    ):
+        """Where a path is at the time of a stage, on the straight line from the row before to this step's, which is
+        where the step ends; and how far it goes in the step. The first one begins at the start."""
+        e = index(wp.tid())
+        count = values.shape[0]
+        rows = path.shape[0] / count
+        step = counters[1]
+        before = start[e]
+        if step > 0:
+            before = path[wp.min(step - 1, rows - 1) * count + e]
+        after = path[wp.min(step, rows - 1) * count + e]
+        values[e] = before + (after - before) * stage_times[stage]
+        motion[e] = after - before
+
+    @wp.kernel(module=module, enable_backward=False)
+    def give_back_along(
+        counters: wp.array(dtype=int),
+        stage: int,
+        stage_times: wp.array(dtype=scalar),
+        values_grad: wp.array(dtype=vec3),
+        path_grad: wp.array(dtype=vec3),
+    ):
+        """Adjoint of ``move_along``."""
+        e = index(wp.tid())
+        count = values_grad.shape[0]
+        rows = path_grad.shape[0] / count
+        step = counters[1]
+        time = stage_times[stage]
+        if step > 0:
+            k = wp.min(step - 1, rows - 1) * count + e
+            path_grad[k] = path_grad[k] + values_grad[e] * (scalar(1.0) - time)
+        k = wp.min(step, rows - 1) * count + e
+        path_grad[k] = path_grad[k] + values_grad[e] * time
+        values_grad[e] = vec3()
+
+    @wp.kernel(module=module, enable_backward=False)
     def record(
         nodes: int,
         counters: wp.array(dtype=int),
@@ -130,4 +174,4 @@ def define(variant: Variant) -> SimpleNamespace:
             if wp.static(sliding):
                 euler_velocity_grad[s] = euler_velocity_grad[s] + frame_euler_velocity_grad[2 * k + d]
 
-    return SimpleNamespace(count=count, take=take, give=give, record=record, recall=recall, receive=receive)
+    return SimpleNamespace(count=count, take=take, give=give, move_along=move_along, give_back_along=give_back_along, record=record, recall=recall, receive=receive)

@@ -275,7 +275,7 @@ def define(variant: Variant) -> SimpleNamespace:
         residual: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance √(b·P⁻¹b), in one launch of one thread.
+        """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch of one thread.
 
         What is held still has an inverse diagonal of 0, so it keeps its value, enters the right-hand side through
         the first residual, and its row of the residual is what holding it takes.
@@ -290,12 +290,9 @@ def define(variant: Variant) -> SimpleNamespace:
             nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
             upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution, q_x, q_s,
         )  # fmt: skip
-        size = zero
         rz = zero
         for i in range(nodes):
-            b = rhs[i]
-            size += wp.dot(wp.cw_mul(inverse_x[i], b), b)
-            r = b - q_x[i]
+            r = rhs[i] - q_x[i]
             z = wp.cw_mul(inverse_x[i], r)
             rz += wp.dot(r, z)
             r_x[i] = r
@@ -303,15 +300,14 @@ def define(variant: Variant) -> SimpleNamespace:
             q_x[i] = vec3()
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    b_s = euler_rhs[s]
-                    size += inverse_s[s] * b_s * b_s
-                    r_1 = b_s - q_s[s]
+                    r_1 = euler_rhs[s] - q_s[s]
                     z_1 = inverse_s[s] * r_1
                     rz += r_1 * z_1
                     r_s[s] = r_1
                     p_s[s] = z_1
                     q_s[s] = zero
 
+        size = rz
         limit = tolerance[0] * tolerance[0] * size
         count = int(0)
         while count < most_iterations and rz > limit:

@@ -36,16 +36,12 @@ SLOW = 0.3
 """Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
 CAUTION = 4.0
-"""A step of the iteration that is not looked at is taken to leave at most so many times the part of a residual that the
-worst in this time step left. One such stage in forty ended above its tolerance, and one in five where steps take 1 ms
-and more; the worst of 1300 at 9 times it. It changed what motions are off by at their end by less than 5 %, of the
-longest steps on 5 × 5 yarns by 15 %. At 2 a twelfth less time, and half as many again above (``benchmarks/motions.py``,
-5 × 5 and 17 × 17, 4 to 1/8 ms)."""
+"""What a step of the iteration leaves is taken to be so many times what the worst contraction of this time step says."""
 TURNING = 0.03
 """Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one
 iteration did with that of the first stage, above 0.045, two to seven, and one or two with its own (17 × 17)."""
-ROUNDING = {wp.float64: 1e-12, wp.float32: 1e-3}
-"""Residual, relative as ``newton_tolerance``, that a stage may end with where no step takes more of it away."""
+ROUNDING = 10.0
+"""Times the rounding of positions that a residual may end with where no step takes more of it away."""
 COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
 """A few units in the last place."""
 
@@ -128,24 +124,95 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_solution[s] = euler_solution_before[s] + euler_direction[s] * step_length[0]
 
     @wp.kernel(module=module, enable_backward=False)
+    def lump_mass(
+        segment_nodes: wp.array(dtype=wp.vec2i),
+        segment_yarn: wp.array(dtype=int),
+        yarn_direction: wp.array(dtype=int),
+        density: wp.array(dtype=scalar),
+        euler: wp.array(dtype=scalar),
+        node_mass: wp.array(dtype=scalar),
+    ):
+        """Half of every segment's mass to each of its nodes."""
+        e = index(wp.tid())
+        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        m = scalar(0.5) * density[index(segment_yarn[e])] * (euler[sb] - euler[sa])
+        wp.atomic_add(node_mass, index(segment_nodes[e][0]), m)
+        wp.atomic_add(node_mass, index(segment_nodes[e][1]), m)
+
+    @wp.kernel(module=module, enable_backward=False)
     def search(
         nodes: int,
+        node_mass: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
         euler_rhs: wp.array(dtype=scalar),
         direction: wp.array(dtype=vec3),
         euler_direction: wp.array(dtype=scalar),
         slope: wp.array(dtype=scalar),
+        kinetic: wp.array(dtype=scalar),
         step_length: wp.array(dtype=scalar),
     ):
-        """Begins a line search along δ: a full step first, and r·δ, how fast r falls along δ."""
+        """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, and δ·M δ."""
         total = scalar(0.0)
+        square = scalar(0.0)
         for i in range(nodes):
-            total += wp.dot(at(rhs, i), at(direction, i))
+            d = at(direction, i)
+            total += wp.dot(at(rhs, i), d)
+            along = scalar(0.0)
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    total += at(euler_rhs, s) * at(euler_direction, s)
+                    d_s = at(euler_direction, s)
+                    total += at(euler_rhs, s) * d_s
+                    along += scalar(0.5) * d_s * d_s
+            square += at(node_mass, i) * (wp.dot(d, d) + along)
         slope[0] = total
+        kinetic[0] = square
         step_length[0] = scalar(1.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def decide(
+        stage: int,
+        newton_tolerance: wp.array(dtype=scalar),
+        slope: wp.array(dtype=scalar),
+        kinetic: wp.array(dtype=scalar),
+        step_length: wp.array(dtype=scalar),
+        # of the step of the iteration before; of the time step
+        last_norm: wp.array(dtype=scalar),
+        contraction: wp.array(dtype=scalar),
+        change: wp.array(dtype=scalar),
+        steps: wp.array(dtype=int),
+        finishes: wp.array(dtype=int),
+        newton_iterations: wp.array(dtype=int),
+        residual: wp.array(dtype=scalar),
+        status: wp.array(dtype=int),
+    ):
+        """Whether the step along δ is the last one: what it leaves is small beside how much velocities change.
+
+        ‖δ‖ is in the norm of A, √(δ·A δ) = √(r·δ), which is more than that of M, and the change in that of M: kinetic
+        energy. What it leaves is taken from the contraction.
+        """
+        norm = wp.sqrt(wp.max(slope[0], scalar(0.0)))
+        left = scalar(CAUTION)
+        if steps[0] > 0:
+            contraction[0] = norm / last_norm[0]
+            left *= contraction[0]
+        elif stage == 0:
+            # not known of a time step's first
+            change[0] = wp.sqrt(kinetic[0])
+            left = scalar(1.0)
+        else:
+            # that of the stage before, whose matrix this one begins with
+            change[0] = wp.max(change[0], wp.sqrt(kinetic[0]))
+            left *= contraction[0] * scalar(CAUTION)
+        steps[0] = steps[0] + 1
+        last_norm[0] = norm
+        newton_iterations[0] = newton_iterations[0] + 1
+        if status[0] == 0:
+            residual[0] = norm / wp.max(change[0], scalar(1.0e-30))
+        finishes[0] = 0
+        if norm == scalar(0.0):
+            finishes[0] = 1
+        elif step_length[0] == scalar(1.0) and left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]:
+            finishes[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -155,8 +222,6 @@ def define(variant: Variant) -> SimpleNamespace:
         inverse_s: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
         euler_rhs: wp.array(dtype=scalar),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
         direction: wp.array(dtype=vec3),
         euler_direction: wp.array(dtype=scalar),
         shortest: wp.array(dtype=scalar),
@@ -164,40 +229,35 @@ def define(variant: Variant) -> SimpleNamespace:
         euler: wp.array(dtype=scalar),
         stage_size: wp.array(dtype=scalar),
         newton_tolerance: wp.array(dtype=scalar),
+        last_norm: wp.array(dtype=scalar),
+        change: wp.array(dtype=scalar),
         # line search, in and out
         slope: wp.array(dtype=scalar),
         step_length: wp.array(dtype=scalar),
         size: wp.array(dtype=scalar),
-        contraction: wp.array(dtype=scalar),
         tries: wp.array(dtype=int),
         # what to do next, and report, out
         continues: wp.array(dtype=int),
-        finishes: wp.array(dtype=int),
         solves: wp.array(dtype=int),
         refreshes: wp.array(dtype=int),
-        newton_iterations: wp.array(dtype=int),
-        residual: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """Whether Newton's iteration ends at w, or with one step more, goes on, or takes back half of the way to w.
+        """Whether Newton's iteration goes on from w, takes back half of the way to w, or cannot go further.
 
-        ‖r‖ is in the norm of A's inverse diagonal and ‖w‖ in that of its diagonal: both are √(energy).
+        ‖r‖ is in the norm of A's inverse diagonal, the mean of each node's, so that it is the same in every frame.
         """
         one = scalar(1.0)
         turned = scalar(0.0)
         of_rhs = scalar(0.0)
-        of_solution = scalar(0.0)
         of_rounding = scalar(0.0)
         for i in range(nodes):
             inverse = at(inverse_x, i)
             r = at(rhs, i)
             if inverse[0] > scalar(0.0) and inverse[1] > scalar(0.0) and inverse[2] > scalar(0.0):
-                w = at(solution, i)
                 x = at(position, i)
-                stiffness = vec3(one / inverse[0], one / inverse[1], one / inverse[2])
-                of_rhs += wp.dot(wp.cw_mul(inverse, r), r)
-                of_solution += wp.dot(wp.cw_mul(stiffness, w), w)
-                of_rounding += wp.dot(wp.cw_mul(stiffness, x), x)
+                stiffness = (one / inverse[0] + one / inverse[1] + one / inverse[2]) * scalar(wp.static(1.0 / 3.0))
+                of_rhs += wp.dot(r, r) / stiffness
+                of_rounding += wp.dot(x, x) * stiffness
                 turned += wp.dot(r, at(direction, i))
             elif is_free[i] != 0:
                 # a matrix without bounds: nothing here means anything
@@ -206,22 +266,17 @@ def define(variant: Variant) -> SimpleNamespace:
                 for s in range(2 * i, 2 * i + 2):
                     inverse_along = at(inverse_s, s)
                     if inverse_along > scalar(0.0):
-                        stiffness_along = one / inverse_along
                         r_s = at(euler_rhs, s)
-                        w_s = at(euler_solution, s)
                         of_rhs += inverse_along * r_s * r_s
-                        of_solution += stiffness_along * w_s * w_s
-                        of_rounding += stiffness_along * at(euler, s) * at(euler, s)
+                        of_rounding += at(euler, s) * at(euler, s) / inverse_along
                         turned += r_s * at(euler_direction, s)
         now = wp.sqrt(of_rhs)
-        scale = wp.sqrt(of_solution)
         # velocities that positions are too coarse to tell from 0
         rounding = wp.sqrt(of_rounding) * scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
         before = size[0]
         first = tries[0] == 0
         tries[0] = tries[0] + 1
         continues[0] = 1
-        finishes[0] = 0
         solves[0] = 1
         refreshes[0] = 0
         stalled = tries[0] > wp.static(MOST_TRIES)
@@ -230,38 +285,26 @@ def define(variant: Variant) -> SimpleNamespace:
             ordered = shortest[0] > scalar(0.0)
             shortest[0] = scalar(wp.static(1.0e30))
         if first or (ordered and (now < before or turned > scalar(-TURNED) * slope[0])):
-            if not first:
-                newton_iterations[0] = newton_iterations[0] + 1
-                # of the worst iteration of the step
-                contraction[0] = wp.max(now / before, wp.where(newton_iterations[0] > 1, contraction[0], scalar(0.0)))
+            if not first and now > scalar(SLOW) * before:
                 # a step that hardly helps: the matrix is of another state
-                if now > scalar(SLOW) * before:
-                    refreshes[0] = 1
-            # what no longer falls, and is less than positions can tell, is rounding
-            settled = not first and now > scalar(0.5) * before and now <= rounding
+                refreshes[0] = 1
+            if now == scalar(0.0) or (not first and now > scalar(0.5) * before and now <= rounding):
+                # what no longer falls, and is less than positions can tell, is rounding
+                continues[0] = 0
             size[0] = now
             before = now
-            if now <= newton_tolerance[0] * scale or settled:
-                continues[0] = 0
-                refreshes[0] = 0
-            elif now * contraction[0] * scalar(CAUTION) <= newton_tolerance[0] * scale:
-                continues[0] = 0
-                refreshes[0] = 0
-                finishes[0] = 1
-                newton_iterations[0] = newton_iterations[0] + 1
+        elif last_norm[0] <= newton_tolerance[0] * change[0]:
+            # the step was small enough before it was taken: rounding
+            continues[0] = 0
         else:
             solves[0] = 0
             refreshes[0] = 1
             step_length[0] = step_length[0] * scalar(0.5)
             stalled = stalled or step_length[0] < scalar(wp.static(SHORTEST_STEP))
-        if status[0] == 0:
-            residual[0] = before / scale
         if status[0] != 0:
             continues[0] = 0
-            finishes[0] = 0
-        elif not wp.isfinite(before) or not wp.isfinite(scale):
+        elif not wp.isfinite(before):
             continues[0] = 0
-            finishes[0] = 0
             status[0] = wp.static(NOT_FINITE)
             status[1] = -1
             for i in range(nodes):
@@ -270,7 +313,7 @@ def define(variant: Variant) -> SimpleNamespace:
         elif stalled and continues[0] != 0:
             continues[0] = 0
             # what rounding leaves cannot be taken away
-            if not (before <= wp.max(scalar(wp.static(ROUNDING[scalar])) * scale, rounding)):
+            if not (before <= rounding * scalar(wp.static(ROUNDING))):
                 status[0] = wp.static(STALLED)
                 status[1] = -1
 
@@ -371,7 +414,9 @@ def define(variant: Variant) -> SimpleNamespace:
         enter_stage=enter_stage,
         look_ahead=look_ahead,
         correct=correct,
+        lump_mass=lump_mass,
         search=search,
+        decide=decide,
         judge=judge,
         shortest_segment=shortest_segment,
         keep_order=keep_order,

@@ -13,7 +13,7 @@ import warp as wp
 from .indexing import coordinates, index
 from .variant import Variant
 
-NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED, INACCURATE = 1, 2, 3, 4, 5
+NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED, INACCURATE, GAINED = 1, 2, 3, 4, 5, 6
 """What went wrong in a step, in ``status[0]``; ``status[1]`` is the node or -1, ``status[2]`` the step of its chunk."""
 
 

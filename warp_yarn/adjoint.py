@@ -50,12 +50,10 @@ class Adjoint:
         frames = {f"frame_{name}_grad": self.arrays[f"loss_{name}"] for name in FRAMES}
         self.simulator.model.launch("receive", "nodes", **frames)
 
-    def _give(self) -> None:
-        """Hands what the step gave to inputs that change from step to step to the rows of their paths."""
-        a = self.arrays
+    def _give(self, stage: int) -> None:
+        """Hands what a stage gave to inputs that change from step to step to the rows of their paths."""
         for name in self.moving:
-            paths = {"values_grad": a[name].grad, "path_grad": a[f"{name}_path"].grad}
-            self.simulator.model.launch("give", len(a[name]), **paths)
+            self.simulator.model.give_inputs(name, stage)
 
     def clear(self) -> None:
         """Sets every gradient that a run adds to back to 0."""

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 from .cloth import Cloth
-from .kernels import TERMS, Term, Variant, build
+from .kernels import TERMS, Term, Variant, build, multilevel
+from .levels import BLOCKS, levels
 from .scene import Scene
 from .state import CLOTH_NUMBERS
 
@@ -69,7 +70,7 @@ class Arrays(dict[str, Any]):
         for name, values in vars(topology).items():
             if name == "neighbour":
                 values = np.ascontiguousarray(values[:, : self.stencil]).ravel()
-            if not isinstance(values, np.ndarray):
+            if not isinstance(values, np.ndarray) or name == "node_yarns":
                 continue
             dtype = vectors[1 if values.ndim == 1 else values.shape[1]]
             # on the CPU the same memory: nothing writes to either
@@ -100,6 +101,8 @@ class Arrays(dict[str, Any]):
             self["pin_target"] = self.numbers(wanted - self.origin)
             if scene.pin_path is not None:
                 self["pin_target_path"] = self.numbers(scene.pin_path.reshape(-1, 3) - self.origin)
+                self["pin_start"] = self.numbers(cloth.position[scene.pins] - self.origin)
+                self["pin_motion"] = self.numbers(np.zeros_like(wanted))
             if scene.pin_stiffness is not None:
                 self["pin_stiffness"] = self.numbers(scene.pin_stiffness)
         if len(scene.force_nodes):
@@ -155,6 +158,45 @@ class Arrays(dict[str, Any]):
         self["weights"] = self.zeros(1, vec3)
         self["step_size"] = self.zeros(1, scalar)
         self["remaining"] = self.zeros(1, scalar)
+        self["stage_times"] = self.zeros(2, scalar)
+
+    def add_levels(self) -> None:
+        """Makes room for the multilevel preconditioner: its index arrays, and what it factorizes."""
+        free = self["is_free"].numpy() != 0
+        found = levels(self.scene.cloth.topology, self.stencil, free)
+        unknowns = 4 if self.variant.sliding else 3
+        scalar, vec3, mat33, sym33 = self.variant.scalar, self.variant.vec3, self.variant.mat33, self.variant.sym33
+        result = multilevel.structs(self.variant.forward).Levels()
+        for name, values in vars(found).items():
+            if isinstance(values, np.ndarray):
+                dtype = wp.int32 if values.dtype == np.int32 else scalar
+                values = np.ascontiguousarray(values).ravel().astype(wp.dtype_to_numpy(dtype))
+                setattr(result, name, wp.array(values, dtype=dtype, device=self.device))
+            else:
+                setattr(result, name, values)
+        coarse = found.coarse_nodes
+        sizes = np.diff(found.level_start)
+        result.coarse_levels = len(sizes)
+        result.exact = int(sizes[-1]) if coarse else 0
+        for name, count, dtype in (
+            ("coarse_block", BLOCKS * coarse, mat33),
+            ("line_factor", 8 * unknowns * len(found.line_node), scalar),
+            ("coarse_line_factor", 24 * len(found.coarse_line_node), scalar),
+            ("halves", self["nodes"], sym33),
+            ("coarse_halves", coarse, sym33),
+            ("coarsest", (3 * result.exact) ** 2, scalar),
+            ("line_work", 4 * len(found.line_node), scalar),
+            ("coarse_line_work", 4 * len(found.coarse_line_node), scalar),
+            ("coarse_r", coarse, vec3),
+            ("coarse_z", coarse, vec3),
+        ):
+            setattr(result, name, self.zeros(count, dtype))
+        self["levels"] = result
+        self.level_start = found.level_start.tolist()
+        self.dims["warp_lines"] = found.warp_lines
+        self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
+        self.dims["coarse_warp_lines"] = found.coarse_warp_lines
+        self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
 
     def put(self, name: str, *values: float) -> None:
         """Sets all numbers of a small array. On the CPU in its own memory: ``assign`` takes 20 µs to get there."""

@@ -6,6 +6,7 @@ What a time step is made of, without saying how: that is for ``integrators``.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import threading
 import time
@@ -18,6 +19,8 @@ import warp as wp
 from .arrays import Arrays
 from .errors import InputError, choice, number, whole
 from .kernels import Variant, build
+from .kernels.ledger import STILL
+from .levels import BLOCKS
 from .scene import Scene
 
 MATRIX = (
@@ -28,15 +31,21 @@ BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
+CHEAP_ENERGIES = {
+    "mass": "energy", "stretch": "elastic_energy", "pins": "elastic_energy", "gravity": "height_energy",
+}  # fmt: skip
+"""Terms whose energy is looked at in every step, and the array that it goes to."""
+OUTER_FORCES = ("wind", "applied")
+"""Terms that do work on the cloth and have no energy."""
 NARROWEST_STRIP = 8
 """Columns; the sweeps need 3 at least, and fewer than these do not pay."""
 SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
 """What differs from one linear solve to another."""
-PRECONDITIONERS = ("incomplete", "jacobi")
+PRECONDITIONERS = ("multilevel", "incomplete", "jacobi")
 PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
-NEWTON_TOLERANCE = 3e-4
+NEWTON_TOLERANCE = 1e-3
 RESOLVED = 4.0
 """Of steps that do not resolve the yarns' vibrations: a stretch wave runs from a crossing to the next in less than the
 ``RESOLVED``-th part of a step. A tenth at most is then added to the error of the second-order methods. The error of
@@ -114,11 +123,14 @@ class Model:
             raise InputError(f"device = {device!r}, must be one of {names}") from error
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
+        self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
         self.arrays = Arrays(scene, variant, self.device)
         self.set_times(self.step_size, self.step_size, self.step_size)
+        self._add_ledger()
         self.arrays["tolerance"] = self.arrays.numbers(self.tolerance)
+        if self.preconditioner == "multilevel":
+            self.arrays.add_levels()
         self._form_team(whole("threads", threads, least=1))
-        self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
 
     def newton_tolerance_at(self, step: float) -> float:
         """As given, or what follows the error of steps of this size."""
@@ -137,10 +149,10 @@ class Model:
     def _form_team(self, threads: int) -> None:
         """Strips of the cloth for so many processor cores (``kernels/team.py``)."""
         a = self.arrays
-        if threads > 1 and not (self.device.is_cpu and self.preconditioner == "incomplete"):
+        if threads > 1 and not (self.device.is_cpu and self.preconditioner != "jacobi"):
             raise InputError(
                 f"threads = {threads}, must be 1 on {self.device} with the {self.preconditioner!r} preconditioner: "
-                "only the CPU's 'incomplete' one shares its work"
+                "only the CPU's 'incomplete' and 'multilevel' ones share their work"
             )
         columns = self.scene.cloth.weave.columns
         self.strips = max(1, min(threads, columns // NARROWEST_STRIP))
@@ -157,15 +169,20 @@ class Model:
         team = self.arrays["team"]
         team.assign(np.where(np.arange(len(team)) == 3, strips, 0).astype(np.int32))
 
-    def set_times(self, step: float, remaining: float, stage: float) -> None:
+    def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
         """The step that kernels make.
 
         Args:
             step: h [s].
             remaining: time in which exact pins reach their targets [s]; more than h in a part of a step.
             stage: of an implicit stage [s]: the matrix is M + stage · D + stage² · H.
+            times: of the stages, in steps: pins with springs are taken to where they are then.
         """
         a = self.arrays
+        begun = 1.0 - remaining / self.step_size
+        # what holds exactly goes straight to the place at the end of the whole step
+        reached = [1.0 if self.held else begun + time * step / self.step_size for time in times]
+        a.put("stage_times", *reached, *[1.0] * (2 - len(reached)))
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("weights", 1.0, stage, stage * stage)
@@ -240,6 +257,19 @@ class Model:
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
+        if self.preconditioner == "multilevel":
+            self._factorize_levels()
+
+    def _factorize_levels(self) -> None:
+        starts = self.arrays.level_start
+        for first, end in itertools.pairwise(starts):
+            self.launch("coarsen", BLOCKS * (end - first), first=first)
+        for direction, name in enumerate(("warp_lines", "weft_lines")):
+            self.launch("factorize_lines", name, direction=direction)
+            self.launch("factorize_coarse_lines", f"coarse_{name}", direction=direction)
+        if len(starts) > 1:
+            first, end = starts[-2:]
+            self.launch("factorize_coarsest", 1, first=first, count=end - first)
 
     def solve(self, **replaced: Any) -> None:
         """The conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
@@ -258,7 +288,8 @@ class Model:
 
     def _launch_solve(self, strip: int) -> None:
         arrays = {name: self.arrays[f"team_{name}"] for name in SOLVED}
-        self.launch("incomplete_conjugate_gradient", 1, strip=strip, most_iterations=self.max_iterations, **arrays)
+        kernel = f"{self.preconditioner}_conjugate_gradient"
+        self.launch(kernel, 1, strip=strip, most_iterations=self.max_iterations, **arrays)
 
     @contextlib.contextmanager
     def team(self) -> Iterator[None]:
@@ -292,6 +323,8 @@ class Model:
         """What every method ends a step with, its end state in place: checks and moves on, and records the frame."""
         if self.scene.sliding:
             self.launch("check_order", "segments")
+        if self.watches:
+            self._close_step()
         self.drag_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
@@ -304,9 +337,79 @@ class Model:
             a[name] = a.zeros(2 * n, a.variant.scalar) if self.scene.sliding else None
         a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, a.variant.scalar)
 
-    def take_inputs(self) -> None:
-        """Puts this step's pins and applied forces in place, where they change."""
-        for name in PATHS:
-            if f"{name}_path" in self.arrays:
-                path, values = self.arrays[f"{name}_path"], self.arrays[name]
-                self.launch("take", len(values), path=path, values=values)
+    def take_inputs(self, stage: int = 0) -> None:
+        """Puts pins and applied forces of a stage of this step in place, where they change."""
+        a = self.arrays
+        if "applied_force_path" in a:
+            path, values = a["applied_force_path"], a["applied_force"]
+            self.launch("take", len(values), path=path, values=values)
+        if "pin_target_path" in a:
+            arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
+            self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
+
+    def give_inputs(self, name: str, stage: int) -> None:
+        """Adjoint of ``take_inputs`` for one of ``PATHS``."""
+        a = self.arrays
+        gradients = {"values_grad": a[name].grad, "path_grad": a[f"{name}_path"].grad}
+        if name == "applied_force":
+            self.launch("give", len(a[name]), **gradients)
+        else:
+            self.launch("give_back_along", "pins", stage=stage, **gradients)
+
+    # -- energy ------------------------------------------------------------------------------------------------------
+
+    def _add_ledger(self) -> None:
+        """Room for the watch over energy (``kernels/ledger.py``)."""
+        a = self.arrays
+        # the reaction of pins that are moved exactly is nowhere at hand
+        self.watches = not (self.held and self.scene.pin_path is not None)
+        for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 1), ("bounds", 5)):
+            a[name] = a.zeros(count, a.variant.scalar)
+        for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely"):
+            a[name] = a.zeros(1, wp.int32)
+        cloth = self.scene.cloth
+        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
+        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
+        a["still_energy"] = a.numbers(0.5 * mass * STILL**2)
+        self.forget_energy()
+
+    def forget_energy(self) -> None:
+        """Begins to watch anew, from the present state on."""
+        for name, value in (("begun", 0), ("audit_due", 1), ("alert", 0)):
+            self.arrays.put(name, value)
+        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0)
+
+    def open_step(self) -> None:
+        """What every method begins a step with: it looks at the energy, if it is time to."""
+        if self.watches:
+            wp.capture_if(self.arrays["audit_due"], on_true=self._audit)
+
+    def _audit(self) -> None:
+        self.press()
+        self.arrays.zero("energy", "elastic_energy", "height_energy")
+        self._add_energies(cheap=True)
+        self._add_energies(cheap=False)
+        self.launch("audit", 1)
+
+    def _add_energies(self, *, cheap: bool) -> None:
+        """Energy of the cheap terms, or of the others."""
+        for term in self.arrays.terms:
+            if term.energy is not None and (term.name in CHEAP_ENERGIES) == cheap:
+                energy = self.arrays[CHEAP_ENERGIES.get(term.name, "energy")]
+                self.launch(f"{term.name}_energy", term.elements, energy=energy)
+
+    def _close_step(self) -> None:
+        """Compares the energy at the end of a step with the work done in it."""
+        a = self.arrays
+        a.zero("energy", "elastic_energy", "height_energy", "power")
+        self._add_energies(cheap=True)
+        self.launch("suspect", 1)
+        wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
+        for term in a.terms:
+            if term.name in OUTER_FORCES:
+                a.zero("q_x")
+                self.launch(term.name, term.elements, matrix=0, press=0, force=a["q_x"])
+                self.launch("add_power", "nodes", force=a["q_x"])
+        if "pin_motion" in a and not self.held:
+            self.launch("add_pin_power", "pins", step_duration=self.step_size)
+        self.launch("close_step", 1)

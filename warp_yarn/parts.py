@@ -1,4 +1,7 @@
-"""Steps made in parts: those that cannot be made at once, and all of them where each may only be so far off."""
+"""Steps made in parts: those that cannot be made at once, and all of them where each may only be so far off.
+
+A part that gains energy is made by the method's fallback, which damps. So is one that cannot be made however small.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .arrays import STATE_TYPES
-from .kernels.step import INACCURATE
+from .kernels.step import GAINED, INACCURATE
 from .model import Graphs, Model
 
 SMALLEST = 2.0**-7
@@ -28,29 +31,36 @@ class Parts:
         model: with the state that a step starts from.
         method: the integrator, one with an error estimate where ``allowed`` is given.
         allowed: error of a part, as of ``error`` [m]; None: any.
+        fallback: makes the method for parts that gain energy; None: there is none.
 
     Attributes:
         size: of the next part, in steps; it follows the error from step to step.
         tried: size of the last part.
         made, rejected: parts made since the beginning, and those that were not good enough or could not be made.
+        damped: parts that the fallback made.
     """
 
-    def __init__(self, model: Model, method: Any, allowed: float | None):
+    def __init__(
+        self, model: Model, method: Any, allowed: float | None, fallback: Callable[[], Any] | None = None
+    ):
         self.model, self.method, self.allowed = model, method, allowed
+        self._make_fallback, self._fallback = fallback, None
+        self.damped = 0
         self.size = self.tried = 1.0
         self.made = self.rejected = 0
         self._graphs = Graphs(model.device)
 
-    def make(self, count: Callable[[], None]) -> float:
+    def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
 
         Args:
             count: tells the device which frame the step starts from, before each part.
+            gained: whether the whole step was seen to gain energy.
 
         Returns:
             The smallest part, in steps; 0 where one could not be made, and ``status`` says why.
         """
-        step, done, smallest = self.model.step_size, 0.0, 1.0
+        done, smallest = 0.0, 1.0
         least = SMALLEST if self.allowed is None else SMALLEST_CONTROLLED
         while done < 1.0:
             left = 1.0 - done
@@ -58,27 +68,52 @@ class Parts:
             parts = max(1, math.ceil(left / self.size - 1e-9))
             size = self.tried = left / parts
             self._copy("kept_", "")
-            count()
-            self.method.set_times(size * step, left * step)
-            self.method.advance()
-            if not self._accepts(size):
+            accepted = not gained and self._try(self.method, count, size, left)
+            if not accepted and self._make_fallback is not None and self._status() != INACCURATE:
+                if gained or self._status() == GAINED or self.size < least:
+                    gained = False
+                    self._restore()
+                    self._fallback = self._fallback or self._make_fallback()
+                    accepted = self._try(self._fallback, count, size, left)
+                    self.damped += accepted
+            if not accepted:
                 self.rejected += 1
                 if self.size < least:
                     return 0.0
-                self.model.arrays.zero("status")
-                self._copy("", "kept_")
+                self._restore()
                 continue
             self.made += 1
             smallest = min(smallest, size)
             done = 1.0 if parts == 1 else done + size
         return smallest
 
-    def _accepts(self, size: float) -> bool:
+    def _try(self, method: Any, count: Callable[[], None], size: float, left: float) -> bool:
+        """Makes a part; whether it is good."""
+        count()
+        method.set_times(size * self.model.step_size, left * self.model.step_size)
+        method.advance()
+        return self._accepts(method, size)
+
+    @property
+    def can_damp(self) -> bool:
+        """Whether there is a fallback."""
+        return self._make_fallback is not None
+
+    def _status(self) -> int:
+        return int(self.model.arrays["status"].numpy()[0])
+
+    def _restore(self) -> None:
+        """Goes back to where the part started."""
+        self.model.arrays.zero("status")
+        self._copy("", "kept_")
+
+    def _accepts(self, method: Any, size: float) -> bool:
         """Whether the part is good; says what size the next is to have."""
-        if self.model.arrays["status"].numpy()[0]:
+        if self._status():
             self.size = 0.5 * size
             return False
-        if self.allowed is None:
+        if self.allowed is None or method is not self.method:
+            self.size = size
             return True
         ratio = self.error() / self.allowed
         factor = MOST_GROWTH if ratio == 0.0 else SAFETY * ratio ** (-1.0 / (self.method.order + 1))
@@ -94,7 +129,7 @@ class Parts:
     def _copy(self, target: str, source: str) -> None:
         """The state, put by or brought back."""
         model, a = self.model, self.model.arrays
-        moving = [name for name in STATE_TYPES if a[name] is not None]
+        moving = [name for name in (*STATE_TYPES, "bounds") if a[name] is not None]
         if "kept_position" not in a:
             for name in moving:
                 a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)

@@ -53,7 +53,9 @@ class Simulator:
     Attributes:
         state: the present state; set it to start from another one.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up.
-        split_steps: which of the steps since the beginning could only be made in parts, and the smallest of these [s].
+        split_steps: which of the steps since the beginning could not be made at once by the method, and their smallest
+            part [s].
+        damped_steps: those of them that gained energy, so that a method which damps made them, or parts of them.
         parts: what makes steps in parts; counts those that it made and rejected.
         arrays: the scene's arrays on the device, by the names that kernels use.
     """
@@ -98,9 +100,12 @@ class Simulator:
                 able = ", ".join(repr(name) for name, other in INTEGRATORS.items() if other.local_error is not None)
                 raise InputError(f"step_error with integrator = {integrator!r}: only {able} estimates its error")
             self.integrator.estimate_errors()
-        self.parts = Parts(self.model, self.integrator, self.step_error and self.step_error * scene.cloth.spacing)
+        fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](self.model)
+        allowed = self.step_error and self.step_error * scene.cloth.spacing
+        self.parts = Parts(self.model, self.integrator, allowed, fallback)
         self.steps_done = 0
         self.split_steps: dict[int, float] = {}
+        self.damped_steps: set[int] = set()
         fitting = min(64, max(1, CHUNK_BYTES // (13 * 8 * scene.cloth.nodes)))
         self.chunk = fitting if chunk is None else whole("chunk", chunk, least=1)
         self.arrays.add_frames(self.chunk + 1)
@@ -134,6 +139,7 @@ class Simulator:
         state = state.checked(self.scene.cloth.nodes)
         self._check_order(state)
         self._upload(state)
+        self.model.forget_energy()
 
     def _check_order(self, state: State) -> None:
         topology = self.scene.cloth.topology
@@ -199,17 +205,22 @@ class Simulator:
 
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
+        gained = False
         if self.step_error is None:
             # it could not be made at once
             self._upload(self._frame(frame))
+            gained = self.parts.can_damp and self.arrays["status"].numpy()[0] == step.GAINED
             self.arrays.zero("status")
-            self.parts.size = 0.5
-        smallest = self.parts.make(lambda: self._count(frame))
+            self.parts.size = 1.0 if gained else 0.5
+        damped = self.parts.damped
+        smallest = self.parts.make(lambda: self._count(frame), gained=gained)
         self.integrator.set_times(self.step_size, self.step_size)
         if smallest:
             self._count(frame + 1)
             if self.step_error is None:
                 self.split_steps[self.steps_done + frame + 1] = smallest * self.step_size
+            if self.parts.damped > damped:
+                self.damped_steps.add(self.steps_done + frame + 1)
         return smallest > 0.0
 
     def run(self, steps: int, *, progress: bool = False) -> Trajectory:
@@ -289,6 +300,7 @@ class Simulator:
                 f"Newton's iteration stopped at a residual of {residual:.1e}, "
                 f"above its tolerance of {self.model.newton_tolerance_at(smallest):.1e}"
             ),
+            step.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
             step.INACCURATE: f"its error stays above step_error = {self.step_error}: allow more",
         }[code]
         raise SimulationError(

@@ -33,6 +33,8 @@ class Topology:
     """[crossings, 4]: left, right, up, down."""
     is_crossing: np.ndarray
     """[nodes]: 1 at a crossing."""
+    node_yarns: np.ndarray
+    """[nodes, 2]: the warp yarn of a node, counted among the warp yarns, and its weft yarn, among the weft yarns."""
     flipped: np.ndarray
     """[nodes]: the draft."""
     corner_jams: np.ndarray
@@ -103,6 +105,7 @@ def rectangle(weave: Weave) -> Topology:
         crossing_node=crossing,
         crossing_neighbours=np.stack([left, right, up, down], axis=1),
         is_crossing=is_crossing,
+        node_yarns=np.stack([row.ravel(), column.ravel()], axis=1),
         flipped=flipped,
         corner_jams=np.stack(jams, axis=1).astype(np.int32),
         corner_blocks=np.concatenate([blocks(pair, ((0, 1),)) for pair in corners], axis=1),

@@ -19,6 +19,7 @@ class LinearlyImplicitEuler:
     name = "linear"
     order = 1
     local_error = None
+    fallback = None
 
     def __init__(self, model: Model):
         self.model = model
@@ -34,6 +35,7 @@ class LinearlyImplicitEuler:
 
     def _step(self) -> None:
         model = self.model
+        model.open_step()
         model.take_inputs()
         model.assemble()
         # The last velocity is the start: a step changes it little.
@@ -46,11 +48,11 @@ class LinearlyImplicitEuler:
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
-    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[], None]) -> None:
+    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """Makes room for the adjoints within a step, and records what the tape reverses.
 
         Args:
-            before, after: launch what a run has to do with adjoints before and after every step.
+            before, after: launch what a run has to do with adjoints before every step, and after every stage of it.
         """
         model, a = self.model, self.model.arrays
         if "seed" not in a:
@@ -83,7 +85,7 @@ class LinearlyImplicitEuler:
         before, after = self._around
         before()
         self._reverse()
-        after()
+        after(0)
 
     def _reverse(self) -> None:
         self._recall()

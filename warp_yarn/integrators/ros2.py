@@ -55,12 +55,13 @@ class ROS2(LinearlyImplicitEuler):
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
-        self.model.set_times(step, remaining, GAMMA * step)
+        self.model.set_times(step, remaining, GAMMA * step, (GAMMA, 1.0 - GAMMA))
         self.model.arrays.put("stage_size", GAMMA * step)
 
     def _step(self) -> None:
         model, a = self.model, self.model.arrays
         first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
+        model.open_step()
         model.take_inputs()
         self._assemble_first()
         model.copy(first_solution="velocity", euler_first_solution="euler_velocity")
@@ -70,6 +71,7 @@ class ROS2(LinearlyImplicitEuler):
         model.launch("enter_second_stage", "nodes", start=a["solution"], euler_start=a["euler_solution"])
         if model.scene.sliding:
             model.launch("check_order", "segments")
+        model.take_inputs(1)
         self._assemble_second()
         model.factorize()
         model.solve()
@@ -88,7 +90,7 @@ class ROS2(LinearlyImplicitEuler):
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
-    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[], None]) -> None:
+    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """As of LinearlyImplicitEuler."""
         model, a = self.model, self.model.arrays
         if "stage_adjoint" not in a:
@@ -107,6 +109,7 @@ class ROS2(LinearlyImplicitEuler):
     def _reverse(self) -> None:
         model, a = self.model, self.model.arrays
         self._recall()
+        model.take_inputs(1)
         model.launch("recall_both_stages", "nodes")
         model.launch("enter_second_stage", "nodes", start=None, euler_start=None)
         self._assemble_second()
@@ -115,8 +118,11 @@ class ROS2(LinearlyImplicitEuler):
         model.launch("second_stage_adjoint", "nodes")
         self._solve()
         self.second_tape.backward()
+        _, after = self._around
+        after(1)
 
         model.launch("recall", "nodes")
+        model.take_inputs()
         self._assemble_first()
         a.zero_grad(*BETWEEN)
         model.launch("first_stage_adjoint", "nodes")

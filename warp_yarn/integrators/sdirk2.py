@@ -18,4 +18,5 @@ class SDIRK2(StageMethod):
     fraction = 1.0 - 0.5**0.5
     carried = 0.5**0.5
     stages = 2
+    fallback = "implicit-euler"
     local_error = 3.0 * fraction**2 - 2.0 * fraction**3 - 1.0 / 6.0

@@ -40,6 +40,8 @@ class StageMethod:
     fraction: float
     carried: float
     stages: int
+    fallback: str | None = None
+    """The method that makes a step again that gained energy."""
     local_error: float | None = None
     """c of the error c h³ d³q/dt³ of a step, where its stages tell the third derivative."""
 
@@ -48,32 +50,38 @@ class StageMethod:
         a = model.arrays
         vec3, scalar, n = a.variant.vec3, a.variant.scalar, a["nodes"]
         sliding = model.scene.sliding
-        for name in ("base_position", "base_velocity", "increment", "direction", "solution_before"):
-            a[name] = a.zeros(n, vec3)
-        for name in ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before"):
-            a[name] = a.zeros(2 * n, scalar) if sliding else None
-        a["base_euler"] = a.zeros(2 * n, scalar)
-        for name in ("size", "slope", "contraction"):
-            a[name] = a.zeros(1, scalar)
-        for name in ("tries", "continues", "finishes", "solves", "refreshes", "crosses", "newton_iterations"):
-            a[name] = a.zeros(1, wp.int32)
-        for name in ("stage_size", "carried_time", "newton_tolerance"):
-            a[name] = a.zeros(1, scalar)
-        rate = self.carried / self.fraction
-        numbers = {"carried_rate": rate, "unit": 1.0, "step_length": 1.0, "shortest": 1e30}
-        numbers["inner_tolerance"] = INNER_TOLERANCE
-        for name, value in numbers.items():
-            a[name] = a.numbers(value)
+        vectors = ("base_position", "base_velocity", "increment", "direction", "solution_before")
+        rates = ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before")
+        numbers = (
+            "size", "slope", "contraction", "kinetic", "last_norm", "change",
+            "stage_size", "carried_time", "carried_rate", "newton_tolerance",
+        )  # fmt: skip
+        counts = ("tries", "steps", "continues", "finishes", "solves", "refreshes", "crosses", "newton_iterations")
+        for names, count, dtype in (
+            (vectors, n, vec3),
+            (rates, 2 * n if sliding else 0, scalar),
+            (("base_euler",), 2 * n, scalar),
+            (("node_mass",), n, scalar),
+            (numbers, 1, scalar),
+            (counts, 1, wp.int32),
+        ):
+            for name in names:
+                # two methods may work on one model, one after the other
+                if name not in a:
+                    a[name] = a.zeros(count, dtype) if count else None
+        for name, value in (("unit", 1.0), ("step_length", 1.0), ("shortest", 1e30), ("inner_tolerance", INNER_TOLERANCE)):
+            a.setdefault(name, a.numbers(value))
         self.set_times(model.step_size, model.step_size)
         self._graphs = Graphs(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
         a, stage = self.model.arrays, self.fraction * step
-        self.model.set_times(step, remaining, stage)
+        self.model.set_times(step, remaining, stage, (self.fraction, self.fraction + self.carried)[: self.stages])
         a.put("newton_tolerance", self.model.newton_tolerance_at(step))
         a.put("stage_size", stage)
         a.put("carried_time", self.carried * step)
+        a.put("carried_rate", self.carried / self.fraction)
 
     # -- graphs ------------------------------------------------------------------------------------------------------
 
@@ -93,11 +101,12 @@ class StageMethod:
         self._begin()
         for stage in range(self.stages):
             if stage:
+                model.take_inputs(stage)
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
                 if estimates:
                     model.copy(predicted="solution")
-            self._newton(first=stage == 0)
+            self._newton(stage)
         if estimates:
             model.launch("estimate_error", 1)
         if self._is_carried:
@@ -132,9 +141,11 @@ class StageMethod:
     def _begin(self) -> None:
         """The stage starts from the present state, at the present velocity."""
         model = self.model
+        model.open_step()
         model.take_inputs()
-        model.arrays.zero("newton_iterations")
-        model.copy(solution="velocity", euler_solution="euler_velocity", contraction="unit")
+        model.arrays.zero("newton_iterations", "node_mass")
+        model.launch("lump_mass", "segments")
+        model.copy(solution="velocity", euler_solution="euler_velocity")
         model.prescribe()
         self._set_base()
 
@@ -158,29 +169,22 @@ class StageMethod:
         mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
         self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
 
-    def _newton(self, *, first: bool) -> None:
-        """Solves the stage. Its matrix is that of its start until convergence is slow: another state's differs less
+    def _newton(self, stage: int) -> None:
+        """Solves a stage. Its matrix is that of its start until convergence is slow: another state's differs less
         from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
         turn."""
         a = self.model.arrays
-        a.zero("tries", "direction", "euler_direction")
+        a.zero("tries", "steps", "direction", "euler_direction")
         if self.model.scene.sliding:
             a.zero("crosses")
             self.model.launch("look_ahead", "segments")
             wp.capture_if(a["crosses"], on_true=lambda: a.zero("euler_solution"))
-        if first:
+        if stage == 0:
             self._evaluate(matrix=True)
         else:
             self._evaluate_as_asked()
         self._judge()
-        wp.capture_while(a["continues"], self._iterate)
-        wp.capture_if(a["finishes"], on_true=self._finish_stage)
-
-    def _finish_stage(self) -> None:
-        """The last iteration, without a look at where it led."""
-        self._solve_direction()
-        self.model.launch("correct", "nodes")
-        self.model.launch("enter_stage", "nodes")
+        wp.capture_while(a["continues"], lambda: self._iterate(stage))
 
     def _evaluate_as_asked(self) -> None:
         wp.capture_if(
@@ -194,14 +198,23 @@ class StageMethod:
             self.model.launch("shortest_segment", "segments")
         self.model.launch("judge", 1)
 
-    def _iterate(self) -> None:
+    def _iterate(self, stage: int) -> None:
         a = self.model.arrays
-        wp.capture_if(a["solves"], on_true=self._solve_direction)
+        a.zero("finishes")
+        wp.capture_if(a["solves"], on_true=lambda: self._solve_direction(stage))
         self.model.launch("correct", "nodes")
+        wp.capture_if(a["finishes"], on_true=self._finish_stage, on_false=self._look)
+
+    def _finish_stage(self) -> None:
+        """Ends with the last step, without a look at where it led."""
+        self.model.launch("enter_stage", "nodes")
+        self.model.arrays.zero("continues")
+
+    def _look(self) -> None:
         self._evaluate_as_asked()
         self._judge()
 
-    def _solve_direction(self) -> None:
+    def _solve_direction(self, stage: int) -> None:
         """δ, from A δ = r."""
         a = self.model.arrays
         a.zero("direction", "euler_direction")
@@ -210,6 +223,7 @@ class StageMethod:
         self.model.launch("search", 1)
         if self.model.scene.sliding:
             self.model.launch("keep_order", "segments")
+        self.model.launch("decide", 1, stage=stage)
 
     @property
     def _rounding(self) -> float:
@@ -226,7 +240,7 @@ class StageMethod:
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
-    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[], None]) -> None:
+    def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """As of LinearlyImplicitEuler."""
         model, a = self.model, self.model.arrays
         vec3, scalar, n, sliding = a.variant.vec3, a.variant.scalar, a["nodes"], model.scene.sliding
@@ -270,7 +284,7 @@ class StageMethod:
         before()
         model.launch("count", 1, by=-1)
         model.launch("recall", "nodes")
-        model.take_inputs()
+        model.take_inputs(self.stages - 1)
         self._set_base()
         if self._is_carried:
             model.launch("recall_carried_stage", "nodes")
@@ -298,6 +312,9 @@ class StageMethod:
     def _enter_first(self) -> None:
         """The stage before it, and w̄ of what it carried to the next."""
         model, a = self.model, self.model.arrays
+        _, after = self._around
+        after(1)
+        model.take_inputs()
         model.launch("recall", "nodes")
         self._set_base()
         self.model.copy(solution="first_solution", euler_solution="euler_first_solution")
@@ -451,4 +468,4 @@ class StageMethod:
             self.held_tape.backward()
         self.model.copy(**{f"{name}_grad": f"base_{name}_grad" for name in STATE})
         _, after = self._around
-        after()
+        after(0)

@@ -1,0 +1,137 @@
+"""A watch over energy: what a step leaves may not be more than what there was and the work that was done since.
+
+    T + V_stretch + V_pins + V_gravity  ≤  E + W + 1 % of what there is of it beside gravity
+
+E is the whole energy at the last audit, all terms' energies at the beginning of a step, which is made every
+``EVERY`` steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken
+for a gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a
+while after a gain. W is the work of wind, applied forces and moving pins since. The same must hold from the start of the
+run on.
+
+A run that fails here would blow up, or be wrong without saying so.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .indexing import index
+from .step import GAINED
+from .variant import Variant
+
+EVERY = 16
+"""Steps between audits: at 16 an audit takes 1 % of a step of the paper's cloth."""
+GAIN = 0.01
+"""Part of the energy that a step may gain: friction's springs and shear's dependence on the contact force have no
+energy of their own in the sum."""
+SUDDEN = 0.1
+"""Part of the energy that yarns give or take in a step that is looked at closely."""
+ALERT = 32
+"""Steps after a gain that are looked at closely."""
+STILL = 1.0e-6
+"""Speed of the whole cloth whose energy may always be gained [m/s]: rounding."""
+
+
+@functools.cache
+def define(variant: Variant) -> SimpleNamespace:
+    scalar, vec3 = variant.scalar, variant.vec3
+    module = variant.module("ledger")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def audit(
+        energy: wp.array(dtype=scalar),
+        height_energy: wp.array(dtype=scalar),
+        # E + W since the last audit, and since the start; energy beside gravity at the last audit; the last step's power,
+        # and its yarns' energy
+        elastic_energy: wp.array(dtype=scalar),
+        bounds: wp.array(dtype=scalar),
+        begun: wp.array(dtype=int),
+        steps_to_audit: wp.array(dtype=int),
+        audit_due: wp.array(dtype=int),
+    ):
+        """Takes all of the energy at the beginning of a step for E."""
+        total = energy[0] + elastic_energy[0] + height_energy[0]
+        if begun[0] == 0:
+            bounds[0] = total
+            bounds[1] = total
+        else:
+            bounds[0] = wp.min(bounds[0], total)
+        bounds[2] = energy[0] + elastic_energy[0]
+        if begun[0] == 0:
+            bounds[4] = elastic_energy[0]
+        begun[0] = 1
+        steps_to_audit[0] = wp.static(EVERY)
+        audit_due[0] = 0
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_power(force: wp.array(dtype=vec3), velocity: wp.array(dtype=vec3), power: wp.array(dtype=scalar)):
+        """Power of outer forces."""
+        i = index(wp.tid())
+        wp.atomic_add(power, 0, wp.dot(force[i], velocity[i]))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_pin_power(
+        pin_node: wp.array(dtype=int),
+        pin_stiffness: wp.array(dtype=scalar),
+        pin_target: wp.array(dtype=vec3),
+        pin_motion: wp.array(dtype=vec3),
+        step_duration: scalar,
+        position: wp.array(dtype=vec3),
+        power: wp.array(dtype=scalar),
+    ):
+        """Power of moving pins: the force of their springs times their velocity."""
+        e = index(wp.tid())
+        pull = (pin_target[e] - position[index(pin_node[e])]) * pin_stiffness[0]
+        wp.atomic_add(power, 0, wp.dot(pull, pin_motion[e]) / step_duration)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def suspect(
+        energy: wp.array(dtype=scalar),
+        elastic_energy: wp.array(dtype=scalar),
+        bounds: wp.array(dtype=scalar),
+        alert: wp.array(dtype=int),
+        looks_closely: wp.array(dtype=int),
+    ):
+        """Whether to add up the other terms too."""
+        looks_closely[0] = alert[0]
+        exchanged = wp.abs(elastic_energy[0] - bounds[4])
+        if exchanged > scalar(SUDDEN) * wp.max(energy[0] + elastic_energy[0], bounds[2]):
+            looks_closely[0] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def close_step(
+        energy: wp.array(dtype=scalar),
+        elastic_energy: wp.array(dtype=scalar),
+        height_energy: wp.array(dtype=scalar),
+        power: wp.array(dtype=scalar),
+        still_energy: wp.array(dtype=scalar),
+        step_size: wp.array(dtype=scalar),
+        bounds: wp.array(dtype=scalar),
+        alert: wp.array(dtype=int),
+        steps_to_audit: wp.array(dtype=int),
+        audit_due: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+    ):
+        """Compares the end of a step with the bounds, which move on if the step is good."""
+        if status[0] == 0:
+            # the larger power of the step's two ends: between them it may have been either
+            work = wp.max(power[0], bounds[3]) * step_size[0]
+            inner = energy[0] + elastic_energy[0]
+            total = inner + height_energy[0]
+            room = scalar(GAIN) * wp.max(inner, bounds[2]) + still_energy[0]
+            room += scalar(1.0e-9) * wp.abs(height_energy[0])
+            if not (total <= wp.min(bounds[0], bounds[1]) + work + room):
+                status[0] = wp.static(GAINED)
+                status[1] = -1
+                alert[0] = wp.static(ALERT)
+            else:
+                bounds[0] += work
+                bounds[1] += work
+                bounds[3] = power[0]
+                bounds[4] = elastic_energy[0]
+                alert[0] = wp.max(alert[0] - 1, 0)
+                steps_to_audit[0] = steps_to_audit[0] - 1
+                audit_due[0] = wp.where(steps_to_audit[0] <= 0, 1, 0)
+
+    return SimpleNamespace(audit=audit, add_power=add_power, add_pin_power=add_pin_power, suspect=suspect, close_step=close_step)
