@@ -414,12 +414,22 @@ def test_the_command_takes_a_scene_from_a_file(tmp_path, capsys):
     assert "gravity moves the cloth by 100 %" in told
 
 
+def test_the_command_takes_a_fabric_by_name(capsys):
+    found = terms_scene.main(["--fabric", "cotton", "--size", "4", "--steps", "2", "--repeats", "1"])
+    assert {"stretch", "wind", "sliding"} <= {change.name for change in found.changes}
+    scene, _ = terms_scene.chosen(terms_scene.parser().parse_args(["--fabric", "cotton", "--size", "4"]))
+    assert scene.cloth.yarns == wy.fabrics.cotton().yarns
+    assert "4 × 4 yarns, 2 steps" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["nowhere.py"], "nowhere.py: there is no such file"),
         (["empty.py"], "must set `scene`"),
         (["empty.py", "--size", "5"], "--size"),
+        (["empty.py", "--fabric", "paper"], "--fabric"),
+        (["--fabric", "felt"], "--fabric"),
         (["--steps", "0"], "--steps = 0"),
         (["--repeats", "0"], "--repeats = 0"),
         (["--step", "0"], "step = 0"),

@@ -3,7 +3,7 @@
 import importlib
 from types import ModuleType
 
-from . import paper
+from . import fabrics, paper
 from .cloth import Cloth, Yarn
 from .errors import GradientError, InputError, SimulationError, WarpYarnError
 from .published import Published, read_published
@@ -29,6 +29,7 @@ __all__ = [
     "Weave",
     "Wind",
     "Yarn",
+    "fabrics",
     "paper",
     "read_published",
     "write_mp4",
