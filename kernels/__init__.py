@@ -57,7 +57,7 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
     variant.fuse("terms")
-    # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does unless told, one
+    # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does by itself, one
     # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
     kernels = {"contact_normal": contact.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
