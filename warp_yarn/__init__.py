@@ -1,6 +1,7 @@
 """Differentiable simulation of woven fabric, yarn by yarn."""
 
 import importlib
+import importlib.metadata
 from types import ModuleType
 
 from . import fabrics, paper
@@ -13,6 +14,8 @@ from .simulator import Simulator
 from .state import State, Trajectory
 from .usd import write_usd
 from .weave import WEAVES, Weave
+
+__version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
     "WEAVES",
@@ -29,6 +32,7 @@ __all__ = [
     "Weave",
     "Wind",
     "Yarn",
+    "__version__",
     "fabrics",
     "paper",
     "read_published",
