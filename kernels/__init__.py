@@ -1,6 +1,7 @@
 """What runs on the device, pure Warp: one file a physical effect, one for the solver, one for the step around it.
 
-Installed as ``warp_yarn.kernels``. A new effect is a new file with its ``TERM``, and one line here.
+Installed as ``warp_yarn.kernels``. A new effect is a new file with its ``TERM``, and one line here; ``CONTRIBUTING.md``
+has the rest.
 """
 
 import functools

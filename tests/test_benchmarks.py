@@ -148,6 +148,7 @@ def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
     assert any(line.get_marker() == "x" for line in drawn.axes[0].lines)
 
 
+@pytest.mark.slow
 def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
     monkeypatch.setattr(work, "STEPS", (1e-3, 5e-4, 2.5e-4))
@@ -296,6 +297,7 @@ def test_array_bytes_counts_each_memory_once():
     assert sizes.array_bytes(simulator) == counted + 7 * 24
 
 
+@pytest.mark.slow
 def test_chart_2_from_the_command(monkeypatch, tmp_path, capsys):
     # in this process: its memory says nothing
     monkeypatch.setattr(sizes, "apart", sizes.measured)
@@ -376,6 +378,7 @@ def test_a_solve_makes_the_iterations_that_it_is_asked_for():
         solver.solve(1000)
 
 
+@pytest.mark.slow
 def test_chart_3_from_the_command(monkeypatch, tmp_path):
     monkeypatch.setattr(bandwidth, "ELEMENTS", 3000)
     output, plot = tmp_path / "b.csv", tmp_path / "b.png"
@@ -527,6 +530,7 @@ def test_wrong_arguments_of_the_command(arguments, named, tmp_path, monkeypatch,
     assert named in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_chart_4_from_the_command(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
     output, plot = tmp_path / "t.csv", tmp_path / "t.png"
@@ -624,6 +628,7 @@ def test_a_broken_run_says_what_broke_it(monkeypatch):
     assert (row["verdict"], row["cause"]) == ("broken", "Newton")
 
 
+@pytest.mark.slow
 def test_the_map_is_drawn(tmp_path):
     maps, others = (stability.Case(),), (stability.Case(size=3),)
     rows = stability.benchmark(maps, others, (6, 2))

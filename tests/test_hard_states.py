@@ -274,6 +274,7 @@ def rests(cloth: wy.Cloth, euler: np.ndarray) -> np.ndarray:
     return euler[:, b, direction] - euler[:, a, direction]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATES)
 def test_ten_times_in_a_row(name: str) -> None:
     """Every step passes its tolerance (or there is an error), crossings keep their order, energy does not grow."""

@@ -4,6 +4,7 @@ The rules are of the tree as it is. A rule that names a module that is gone fail
 """
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -64,6 +65,7 @@ def imported(source: str, name: str, is_package: bool) -> set[str]:
     return found
 
 
+@functools.cache
 def of(name: str) -> set[str]:
     file = MODULES[name]
     return imported(file.read_text(), name, file.name == "__init__.py")

@@ -159,6 +159,7 @@ def test_a_folder_that_cannot_be_made_ends_with_code_2(tmp_path, capsys):
     assert "file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pictures_on_request(usd, tmp_path):
     png, mp4 = tmp_path / "hang.png", tmp_path / "pictures" / "hang.mp4"
     arguments = ["--size", "3", "--steps", "4", "--slowdown", "20", "--png", str(png), "--mp4", str(mp4)]

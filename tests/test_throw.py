@@ -71,6 +71,7 @@ def test_the_written_throw_is_the_best_one(forces):
     assert np.linalg.norm(centre - problem.target) == pytest.approx(min(found.distances), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_throw_that_cannot_be_simulated_is_taken_back_half_of_the_way(usd):
     # At a hundred times the optimizer's full step, the second throw tears the cloth.
     arguments = [*SMALL, "--forces", "--rate", "100", "--iterations", "12", "--output", str(usd)]
@@ -132,6 +133,7 @@ def test_what_is_kept_is_the_states_alone(sliding, every):
     assert gradients.kept_bytes(case.call()) == state * (STEPS + 1 if every == 1 else STEPS // every)
 
 
+@pytest.mark.slow
 def test_a_row_of_the_cost_table(tmp_path):
     rows = gradients.cost(4, (1, 3), STEPS, repeats=1, few=2, many=4)
     methods = [(row["method"], row["checkpoint_every"]) for row in rows]
