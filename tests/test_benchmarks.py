@@ -47,12 +47,12 @@ def test_ours_and_scipy_solve_the_same_system_to_the_same_tolerance():
 
 
 def test_a_row_reaches_the_csv_file_with_the_environment(tmp_path):
-    row = solver.benchmark(3, repeats=1)
+    row = solver.benchmark(3, repeats=1, fabric="cotton")
     path = tmp_path / "results" / "solver.csv"
     solver.write_csv(path, [row], solver.environment("scipy"))
     with open(path, newline="") as file:
         (read,) = csv.DictReader(file)
-    assert read["size"] == "3 × 3"
+    assert (read["fabric"], read["size"]) == ("cotton", "3 × 3")
     # 9 nodes of 3 unknowns, one crossing of 2
     assert read["unknowns"] == "29"
     assert float(read["scipy [ms]"]) > 0.0
