@@ -28,7 +28,7 @@ motions = sys.modules["motions"]
 def on_all_cores(monkeypatch):
     """The tests' own process keeps its cores."""
     monkeypatch.setattr(bandwidth, "cores", lambda count: None)
-    for module in (work, sizes, terms):
+    for module in (work, equal, control, sizes, terms):
         monkeypatch.setattr(module, "one_core", lambda: None)
 
 
@@ -264,6 +264,23 @@ def test_methods_are_timed_beside_each_other():
     assert min(map(min, seconds.values())) > 0.0
 
 
+def test_equal_error_from_the_command(monkeypatch, tmp_path):
+    monkeypatch.setattr(equal, "reference", lambda motion, size: None)
+    # the last method never gets there
+    last = list(equal.INTEGRATORS)[-1]
+    monkeypatch.setattr(equal, "steps_to", lambda motion, size, method, *_: [2, None] if method == last else [2, 4])
+    output = tmp_path / "e.csv"
+    chosen = ["--motions", "hung", "strip", "--sizes", "3", "4", "--fabric", "handkerchief"]
+    equal.main([*chosen, "--repeats", "1", "--output", str(output)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    kinds = [("hung", "3 × 3"), ("hung", "4 × 4"), ("strip", "5 × 3"), ("strip", "5 × 4")]
+    assert list(dict.fromkeys((row["motion"], row["size"]) for row in rows)) == kinds
+    assert len(rows) == len(kinds) * len(equal.TARGETS) * len(equal.INTEGRATORS)
+    assert {row["fabric"] for row in rows} == {"handkerchief"}
+    assert {row["method"] for row in rows if row["of eq. 2's"] == ""} == {last}
+
+
 # -- benchmarks/step_control.py ---------------------------------------------------------------------------------------
 
 
@@ -283,6 +300,20 @@ def test_parts_are_compared_with_even_steps_of_their_error(monkeypatch):
     for row in (loose, tight):
         share = np.log(even["error"] / row["error"]) / np.log(even["error"] / finer["error"])
         assert row["of even's"] == pytest.approx(20.0 / (5.0 * 16.0**share))
+
+
+def test_step_control_from_the_command(monkeypatch, tmp_path):
+    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
+    monkeypatch.setattr(control, "COUNTS", (5, 20))
+    monkeypatch.setattr(control, "STEP_ERRORS", (1e-2,))
+    end = work.end(SHORT.simulator(3, step=1e-4), 50)
+    monkeypatch.setattr(control, "reference", lambda motion, size: work.Reference(end, 1e-4, "", 0.0))
+    output = tmp_path / "c.csv"
+    control.main(["--size", "3", "--motions", "hung", "--fabric", "paper", "--repeats", "1", "--output", str(output)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["step error"] for row in rows] == ["even", "even", "0.01"]
+    assert {(row["fabric"], row["size"]) for row in rows} == {("paper", "3 × 3")}
 
 
 # -- benchmarks/sizes.py ----------------------------------------------------------------------------------------------
