@@ -26,6 +26,7 @@ def test_every_kernel_of_a_variant_is_compiled(compile_cuda):
     assert {"warp_yarn_terms_float32_sliding_reverse", "warp_yarn_terms_float64_locked_reverse"} <= set(quick)
 
 
+@pytest.mark.slow
 def test_code_that_is_not_cuda_is_found(compile_cuda, tmp_path, monkeypatch, capfd):
     def define(name, snippet):
         @wp.func_native(snippet)
@@ -50,6 +51,7 @@ def test_code_that_is_not_cuda_is_found(compile_cuda, tmp_path, monkeypatch, cap
     assert "0 of 1 modules" in told.out
 
 
+@pytest.mark.slow
 def test_the_contact_is_not_contracted(tmp_path):
     """A cross product is two products and a difference, as on the CPU."""
     variant = Variant(wp.float64, False)

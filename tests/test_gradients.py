@@ -95,8 +95,12 @@ def gradcheck(function: Callable, inputs: list[torch.Tensor]) -> bool:
     return torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
+FEW = ("materials", "initial state")
+MARKED_GROUPS = [group if group in FEW else pytest.param(group, marks=pytest.mark.slow) for group in GROUPS]
+
+
 @pytest.mark.parametrize("steps", [1, pytest.param(5, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", MARKED_GROUPS)
 def test_gradcheck(group: str, steps: int) -> None:
     rollout = wt.Rollout(scene_for(group, steps), steps, frames=[steps], integrator="linear", tolerance=EXACT)
     fixed = jittered(rollout.scene.cloth)

@@ -310,6 +310,7 @@ def check_energy(energies: list[dict[str, float]], overshoot: float, rounding: f
     assert (total - np.minimum.accumulate(total)).max() <= overshoot * own + rounding * size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["straight", "strip", "no_pins", "storm", "heavy"])
 def test_gradient_of_smooth_motion(name: str) -> None:
     """By the initial positions and velocities and by the materials, against extrapolated differences."""
