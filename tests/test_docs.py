@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import inspect
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -70,3 +71,18 @@ def test_links_lead_somewhere(page):
         assert path.exists(), target
         if anchor:
             assert anchor in anchors(path.read_text()), target
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    section = (ROOT / "README.md").read_text().split("## Test it")[1]
+    command = re.search(r"```bash\n(.+)\n```", section)[1]
+    assert ".venv/bin/mypy" in command and command.endswith(".venv/bin/pytest")
+    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
+
+
+def test_the_package_says_its_version_and_that_it_has_types():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert wy.__version__ == project["project"]["version"]
+    assert project["tool"]["setuptools"]["package-data"]["warp_yarn"] == ["py.typed"]
+    assert (ROOT / "warp_yarn" / "py.typed").exists()
+    assert f"## {wy.__version__}" in (ROOT / "CHANGELOG.md").read_text()
