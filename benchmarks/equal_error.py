@@ -1,6 +1,6 @@
 """Times at equal error: what each method takes to be 1 % and 0.1 % off, side by side.
 
-    python benchmarks/equal_error.py [--sizes 5 17] [--motion hung] [--repeats 9]
+    python benchmarks/equal_error.py [--sizes 5 17] [--motions hung drop] [--fabric cotton] [--repeats 9]
 
 Chart 1 (``work_precision.py``) has points at given steps, measured one after the other; this is for ratios. Each method
 makes the motion, with default tolerances and double precision, at the largest step (of those that fit whole times) from
@@ -12,6 +12,7 @@ turns. One core; loading kernels and capturing graphs come before.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, turns, write_csv
-from motions import MOTIONS, Motion
+from motions import Motion, add_options, find
 from work_precision import EQ_2, TARGETS, Reference, end, reference
 
 from warp_yarn.integrators import INTEGRATORS
@@ -90,7 +91,7 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
         steps = {method: counts[k] for method, counts in needed.items() if counts[k] is not None}
         seconds = side_by_side(motion, size, steps, repeats)
         for method in INTEGRATORS:
-            row: dict[str, Any] = {"motion": name, "size": f"{size} × {size}", "error": target, "method": method}
+            row: dict[str, Any] = {"motion": name, **motion.about(size), "error": target, "method": method}
             if method not in steps:
                 empty = dict.fromkeys(("step [ms]", "wall [s per simulated s]", "wall IQR", "of eq. 2's", "of IQR"), "")
                 result.append(row | empty | {"step [ms]": f"< {1e3 * motion.duration / MOST_STEPS:.2g}"})
@@ -110,7 +111,7 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[5, 17], help="rows and columns (5 17)")
-    parser.add_argument("--motion", choices=MOTIONS, default="hung", help="(%(default)s)")
+    add_options(parser, default=["hung"])
     parser.add_argument("--repeats", type=int, default=9, help="turns (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "equal_error.csv", help="CSV file (%(default)s)")
     options = parser.parse_args(arguments)
@@ -119,8 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     about = environment()
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     table = []
-    for size in options.sizes:
-        table += rows(MOTIONS[options.motion], options.motion, size, options.repeats)
+    for name, size in itertools.product(options.motions, options.sizes):
+        table += rows(find(name, options.fabric), name, size, options.repeats)
         print_table(table[-len(TARGETS) * len(INTEGRATORS) :])
     write_csv(options.output, table, about)
     print("written:", options.output)

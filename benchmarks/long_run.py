@@ -1,6 +1,6 @@
-"""A hundred thousand steps of the paper's hung cloth: what its energy and this process's memory do.
+"""A hundred thousand steps of a hung cloth: what its energy and this process's memory do.
 
-    python benchmarks/long_run.py [--size 5] [--steps 100000]
+    python benchmarks/long_run.py [--size 5] [--fabric cotton] [--steps 100000]
 
 The wind blows for the first half and then stops. From there on the energy (kinetic, of every term and of gravity) may
 only fall: the command fails where it grows, or anything is not finite, or memory grows.
@@ -20,6 +20,7 @@ from common import RESULTS, environment, one_core, print_table, write_csv
 
 import warp_yarn as wy
 from warp_yarn import paper
+from warp_yarn.fabrics import FABRICS
 
 SAMPLES = 100
 """Of energy and memory, equally spaced."""
@@ -39,9 +40,9 @@ def memory() -> float:
     return pages * 4096 / 1e6
 
 
-def run(size: int, steps: int) -> list[dict[str, Any]]:
+def run(size: int, steps: int, fabric: str = "paper") -> list[dict[str, Any]]:
     """A row a sample."""
-    simulator = wy.Simulator(paper.hung_cloth(rows=size, columns=size))
+    simulator = wy.Simulator(paper.hung(FABRICS[fabric](rows=size, columns=size)))
     rows = []
     part = max(1, steps // SAMPLES)
     for _ in tqdm.trange(steps // part, unit="sample", disable=None):
@@ -54,6 +55,7 @@ def run(size: int, steps: int) -> list[dict[str, Any]]:
         energy = simulator.energy()
         rows.append(
             {
+                "fabric": fabric,
                 "step": simulator.steps_done,
                 "wind": float(simulator.arrays["wind_velocity"].numpy()[0, 1]),
                 "finite": finite,
@@ -80,12 +82,13 @@ def faults(rows: list[dict[str, Any]]) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=5, help="rows and columns (%(default)s)")
+    parser.add_argument("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     parser.add_argument("--steps", type=int, default=100_000, help="(%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "long_run.csv", help="CSV file (%(default)s)")
     options = parser.parse_args()
     one_core()
     wp.config.log_level = wp.LOG_WARNING
-    rows = run(options.size, options.steps)
+    rows = run(options.size, options.steps, options.fabric)
     print_table(rows[:: max(1, len(rows) // 20)])
     write_csv(options.output, rows, environment())
     print("written:", options.output)

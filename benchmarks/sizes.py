@@ -2,8 +2,9 @@
 
     python benchmarks/sizes.py [--sizes 5 10 25 50 100 200 400 600] [--steps 5] [--largest] [--integrator linear]
 
-The paper's hung cloth at its step of 1 ms, double precision, with sliding yarns and without, each in a process of its
-own, on one core: 5 steps from rest, as at every size, and then those that are measured. --largest adds 1000 × 1000.
+The paper's hung cloth, or one of another fabric (--fabric), at its step of 1 ms, double precision, with sliding yarns
+and without, each in a process of its own, on one core: 5 steps from rest, as at every size, and then those that are
+measured. --largest adds 1000 × 1000.
 
 Time: the median of single steps, all that a step costs. Iterations: of the conjugate gradient, the mean of those steps
 (with an implicit method: of the last solve of each). Memory: the most that the process needed, less what one with a
@@ -32,6 +33,7 @@ from plots import COLORS, MARKERS, PICTURES, save
 
 import warp_yarn as wy
 from warp_yarn import paper
+from warp_yarn.fabrics import FABRICS
 from warp_yarn.integrators import INTEGRATORS
 
 SIZES = (5, 10, 25, 50, 100, 200, 400, 600)
@@ -55,7 +57,7 @@ def array_bytes(simulator: wy.Simulator) -> int:
     return sum({array.ptr: array.capacity for array in arrays}.values())
 
 
-def measured(size: int, sliding: bool, integrator: str, steps: int) -> dict[str, Any]:
+def measured(size: int, sliding: bool, integrator: str, fabric: str, steps: int) -> dict[str, Any]:
     """Steps of one cloth, in this process: the times of each [s], mean iterations, and bytes; or why there are none.
 
     (A SimulationError does not travel between processes.)
@@ -63,7 +65,7 @@ def measured(size: int, sliding: bool, integrator: str, steps: int) -> dict[str,
     one_core()
     wp.config.log_level = wp.LOG_WARNING
     begin = time.perf_counter()
-    scene = paper.hung_cloth(rows=size, columns=size, sliding=sliding)
+    scene = paper.hung(FABRICS[fabric](rows=size, columns=size), sliding=sliding)
     # one frame at a time, as in a run of a large cloth
     simulator = wy.Simulator(scene, step=paper.STEP, integrator=integrator, chunk=1)
     made = time.perf_counter() - begin
@@ -93,12 +95,13 @@ def apart(*arguments: Any) -> dict[str, Any]:
         return apart.submit(measured, *arguments).result()
 
 
-def benchmark(sizes: Sequence[int], sliding: bool, integrator: str, steps: int) -> list[dict[str, Any]]:
+def benchmark(sizes: Sequence[int], sliding: bool, integrator: str, fabric: str, steps: int) -> list[dict[str, Any]]:
     """A row for each size; one that failed has a reason and no numbers."""
-    rows, tiny = [], apart(TINY, sliding, integrator, steps)
+    rows, tiny = [], apart(TINY, sliding, integrator, fabric, steps)
     for size in sizes:
-        about = {"size": f"{size} × {size}", "crossings": size * size, "sliding": sliding, "method": integrator}
-        found = apart(size, sliding, integrator, steps if size > 200 else 4 * steps)
+        about = {"fabric": fabric, "size": f"{size} × {size}", "crossings": size * size}
+        about |= {"sliding": sliding, "method": integrator}
+        found = apart(size, sliding, integrator, fabric, steps if size > 200 else 4 * steps)
         if "failure" in found:
             print(f"{size} × {size} failed: {found['failure']}", flush=True)
             rows.append({**about, **dict.fromkeys(numbers(tiny, tiny, 1), ""), **found})
@@ -140,7 +143,7 @@ def add_relative(rows: Sequence[dict[str, Any]]) -> None:
         row[f"relative to {LARGE} × {LARGE}"] = "" if base is None or own is None else own / base
 
 
-def draw(tables: dict[bool, list[dict[str, Any]]]) -> Figure:
+def draw(tables: dict[bool, list[dict[str, Any]]], fabric: str) -> Figure:
     figure = Figure(figsize=(9.5, 7.5), layout="constrained")
     time_axes, crossing_axes, iteration_axes, memory_axes = figure.subplots(2, 2).ravel()
     for at, (sliding, table) in enumerate(tables.items()):
@@ -176,7 +179,7 @@ def draw(tables: dict[bool, list[dict[str, Any]]]) -> Figure:
             axes.set_ylim(bottom=0.0)
         axes.legend(fontsize=8)
     memory_axes.set_title("dashed: what is wanted at most", fontsize=9)
-    figure.suptitle("Cost against size: the paper's hung cloth, steps of 1 ms, one core")
+    figure.suptitle(f"Cost against size: a hung cloth ({fabric}), steps of 1 ms, one core")
     return figure
 
 
@@ -188,6 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--steps", type=int, default=5, help="measured; four times as many up to 200 × 200 (%(default)s)"
     )
     parser.add_argument("--integrator", choices=INTEGRATORS, default="linear", help="(%(default)s)")
+    parser.add_argument("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "sizes.csv", help="CSV file (%(default)s)")
     parser.add_argument("--plot", type=Path, default=PICTURES / "sizes.png", help="PNG file (%(default)s)")
     options = parser.parse_args(arguments)
@@ -196,7 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     tables = {}
     for sliding in (True, False):
         sizes = [*options.sizes, *([LARGEST] if options.largest and sliding else [])]
-        tables[sliding] = benchmark(sizes, sliding, options.integrator, options.steps)
+        tables[sliding] = benchmark(sizes, sliding, options.integrator, options.fabric, options.steps)
     for sliding, rows in tables.items():
         print(f"\n{'with' if sliding else 'without'} sliding")
         add_relative(rows)
@@ -205,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if fitted is not None:
             print(f"slope of time over crossings: {fitted:.3f}")
     write_csv(options.output, [row for rows in tables.values() for row in rows], about)
-    save(draw(tables), options.plot)
+    save(draw(tables, options.fabric), options.plot)
     print("written:", options.output, options.plot)
 
 

@@ -1,6 +1,6 @@
-"""A full step against one SciPy solve of its linear system, on the paper's hung cloth, all terms, double precision.
+"""A full step against one SciPy solve of its linear system, on a hung cloth, all terms, double precision.
 
-    python benchmarks/solver.py [--sizes 5 9 17 25 33] [--repeats 15]
+    python benchmarks/solver.py [--sizes 5 9 17 25 33] [--fabric cotton] [--repeats 15]
 
 One core. "step" is everything a step costs: forces, matrix, contact, solve, update, and copying the frame out, as the
 mean of consecutive steps of Simulator.run, replayed from a captured graph. "locked" is the same of the cloth without
@@ -31,6 +31,7 @@ from common import RESULTS, environment, measure, one_core, print_table, write_c
 
 import warp_yarn as wy
 from warp_yarn import paper
+from warp_yarn.fabrics import FABRICS
 
 WARM_UP = 50
 """Steps before the one that is measured: the cloth moves and bends by then."""
@@ -100,9 +101,9 @@ def velocities(simulator: wy.Simulator) -> np.ndarray:
     return np.concatenate([part.ravel() for part in parts])
 
 
-def simulators(size: int) -> dict[str, wy.Simulator]:
+def simulators(size: int, fabric: str = "paper") -> dict[str, wy.Simulator]:
     """One for each of our preconditioners, on the same moving cloth."""
-    scene = paper.hung_cloth(rows=size, columns=size)
+    scene = paper.hung(FABRICS[fabric](rows=size, columns=size))
     result = {name: wy.Simulator(scene, preconditioner=name, **METHOD) for name in ("incomplete", "jacobi")}
     result["incomplete"].run(WARM_UP)
     result["jacobi"].state = result["incomplete"].state
@@ -123,11 +124,11 @@ def compare(ours: dict[str, wy.Simulator], tolerance: float | None = None) -> di
     return {**result, "scipy": {"iterations": iterations, "error": scaled.error(solution)}}
 
 
-def benchmark(size: int, repeats: int) -> dict[str, Any]:
+def benchmark(size: int, repeats: int, fabric: str = "paper") -> dict[str, Any]:
     """One row of the table."""
-    ours = simulators(size)
+    ours = simulators(size, fabric)
     scaled = Scaled.of(ours["jacobi"])
-    locked = wy.Simulator(paper.hung_cloth(rows=size, columns=size, sliding=False), **METHOD)
+    locked = wy.Simulator(paper.hung(FABRICS[fabric](rows=size, columns=size), sliding=False), **METHOD)
     locked.run(WARM_UP)
     start = ours["jacobi"].state
 
@@ -148,7 +149,7 @@ def benchmark(size: int, repeats: int) -> dict[str, Any]:
     without, *timings = measure([*map(step, (locked, *ours.values())), solve], repeats)
     for simulator in ours.values():
         simulator.state = start
-    row: dict[str, Any] = {"size": f"{size} × {size}", "unknowns": len(scaled.rhs)}
+    row: dict[str, Any] = {"fabric": fabric, "size": f"{size} × {size}", "unknowns": len(scaled.rhs)}
     names = [*(f"step, {name}" for name in ours), "scipy"]
     for name, timing, facts in zip(names, timings, compare(ours).values(), strict=True):
         row |= {**timing.columns(name), f"{name} iterations": facts["iterations"], f"{name} error": facts["error"]}
@@ -160,18 +161,23 @@ def benchmark(size: int, repeats: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="rows and columns (%(default)s)")
+    parser.add_argument("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     parser.add_argument("--repeats", type=int, default=15, help="timed runs (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "solver.csv", help="CSV file (%(default)s)")
     options = parser.parse_args()
     one_core()
     wp.config.log_level = wp.LOG_WARNING
     about = environment("scipy")
-    rows = [benchmark(size, options.repeats) for size in options.sizes]
+    rows = [benchmark(size, options.repeats, options.fabric) for size in options.sizes]
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     print(f"medians of {options.repeats} runs; IQR: interquartile range")
     for columns in (("step, incomplete", "locked"), ("step, jacobi",), ("scipy",)):
         shown = [
-            {key: value for key, value in row.items() if key in ("size", "unknowns") or key.startswith(columns)}
+            {
+                key: value
+                for key, value in row.items()
+                if key in ("fabric", "size", "unknowns") or key.startswith(columns)
+            }
             for row in rows
         ]
         print_table(shown)

@@ -1,10 +1,14 @@
 """Where each time-stepping method is accurate, stable but damped, or broken, and what broke it.
 
-    python benchmarks/stability.py [--quick] [--png docs/stability.png]
+    python benchmarks/stability.py [--quick] [--fabric cotton] [--densities 1 0.1 0.01] [--png docs/stability.png]
 
-The paper's hung cloth in its wind, all terms, for 1/15 s. First a map for every method: time step (1e-4 to 1/30 s) by
-stretch modulus (a hundredth to a hundred times the paper's), 5 × 5 plain. Then, at the paper's modulus, the step by
-friction, weave, size and precision, one at a time: the full product would be some 10⁴ runs.
+The paper's hung cloth in its wind, all terms, for 1/15 s. First maps for every method: time step (1e-4 to 1/30 s) by
+stretch modulus (a hundredth to a hundred times the fabric's), 5 × 5 plain, one map for each density. Then, as the
+fabric is, the step by friction, weave, size, precision and fabric, one at a time: the full product would be some 10⁴
+runs.
+
+How stiff a case is, is k_s h²/(m L) of its stiffest yarn, m = ρ L being the mass of a segment; it is in the table, and
+runs in which it is above 3e7 are left out: cotton has 5e6 at 1 ms.
 
 Accurate: the positions at the end are within 5 % of the largest displacement on the way (root mean squares) of those
 of the second-order method at 1/30 ms. Damped: stable, and farther off. Broken: the run ended in an error, or moved
@@ -17,6 +21,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +37,7 @@ from matplotlib.patches import Patch, Rectangle
 
 import warp_yarn as wy
 from warp_yarn import paper
+from warp_yarn.fabrics import FABRICS
 from warp_yarn.files import whole_file
 from warp_yarn.integrators import INTEGRATORS
 
@@ -41,6 +48,9 @@ FINEST = 2000
 LARGE = 50
 """Rows from which on a cloth takes too long for short steps, and for the reference."""
 STRETCH = (1e-2, 1e-1, 1.0, 1e1, 1e2)
+DENSITY = (1.0, 1e-1, 1e-2)
+STIFFEST = 3e7
+"""k_s h²/(m L) from which on a run is left out."""
 ACCURATE, FAR = 0.05, 3.0
 VERDICTS = ("accurate", "stable, damped", "broken")
 COLORS = ("#5aae61", "#fee08b", "#d6604d")
@@ -50,31 +60,55 @@ CAUSES = {"Δs": "Δs", "Newton": "Newton", "not finite": "inf", "solver": "solv
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A cloth: its stretch moduli in the paper's, and so on."""
+    """A hung cloth: its stretch moduli and densities in the fabric's, and so on."""
 
     stretch: float = 1.0
+    density: float = 1.0
     friction: float = 0.5
     weave: str = "plain"
     size: int = 5
     precision: str = "double"
+    fabric: str = "paper"
+
+    def cloth(self) -> wy.Cloth:
+        make = FABRICS[self.fabric]
+        cloth = make(rows=self.size, columns=self.size, weave=self.weave, friction=self.friction)
+        cloth.yarns = tuple(
+            dataclasses.replace(yarn, stretch=self.stretch * yarn.stretch, density=self.density * yarn.density)
+            for yarn in cloth.yarns
+        )
+        return cloth
 
     def scene(self, **options: Any) -> wy.Scene:
-        yarns = [dataclasses.replace(y, stretch=self.stretch * y.stretch) for y in (paper.YARNS[1], paper.YARNS[2])]
-        weave = wy.WEAVES[self.weave](rows=self.size, columns=self.size)
-        cloth = wy.Cloth(weave, yarns=yarns, shear=paper.SHEAR[1, 2], friction=self.friction)
-        return paper.hung(cloth, **options)
+        return paper.hung(self.cloth(), **options)
+
+    def stiffness(self, step: float) -> float:
+        """k_s h²/(m L) of the stiffest yarn for its mass."""
+        cloth = self.cloth()
+        mass = np.array([yarn.density for yarn in cloth.yarns]) * cloth.spacing
+        return float((cloth.stretch_stiffness / mass).max() * step**2 / cloth.spacing)
 
     def counts(self) -> tuple[int, ...]:
-        """Of steps; large cloths at the longer steps alone."""
-        return COUNTS if self.size < LARGE else COUNTS[3:]
+        """Of steps; large cloths at the longer steps alone, stiff ones at the shorter."""
+        counts = COUNTS if self.size < LARGE else COUNTS[3:]
+        return tuple(count for count in counts if self.stiffness(DURATION / count) <= STIFFEST)
 
-    def label(self) -> str:
-        """What sets it apart from the paper's."""
+    def farthest(self) -> float:
+        """How far gravity and the wind's pressure would have brought it by the end, were nothing to hold it [m]."""
+        cloth = self.cloth()
+        mass = 2.0 * min(yarn.density for yarn in cloth.yarns) / cloth.spacing
+        pressure = wy.Wind(velocity=paper.WIND).density * float(np.square(paper.WIND).sum())
+        return 0.5 * (9.8 + pressure / mass) * DURATION**2
+
+    def label(self, usual: Case) -> str:
+        """What sets it apart from the usual one."""
         changed = {
-            f.name: getattr(self, f.name) for f in dataclasses.fields(self) if getattr(self, f.name) != f.default
+            f.name: getattr(self, f.name)
+            for f in dataclasses.fields(self)
+            if getattr(self, f.name) != getattr(usual, f.name)
         }
         if not changed:
-            return "the paper's"
+            return usual.fabric
         (name, value), *_ = changed.items()
         return {"size": f"{value} × {value}", "friction": f"μ = {value}"}.get(name, str(value))
 
@@ -91,6 +125,7 @@ OTHERS = (
     Case(size=33),
     Case(size=100),
     Case(precision="single"),
+    *(Case(fabric=name) for name in FABRICS if name != "paper"),
 )
 
 
@@ -122,7 +157,8 @@ def size_of(x: np.ndarray) -> float:
 
 def judge(case: Case, method: str, count: int) -> dict[str, Any]:
     """A row of the table: what became of a run."""
-    row = {"method": method, **dataclasses.asdict(case), "step [s]": DURATION / count}
+    step = DURATION / count
+    row = {"method": method, **dataclasses.asdict(case), "step [s]": step, "k_s h²/(m L)": case.stiffness(step)}
     try:
         position, farthest = end(case, method, count)
     except wy.SimulationError as error:
@@ -131,8 +167,8 @@ def judge(case: Case, method: str, count: int) -> dict[str, Any]:
         return {**row, "verdict": VERDICTS[2], "error": "", "cause": cause, "message": message}
     reference = converged(case)
     if reference is None:
-        # nothing to compare with: a cloth of n rows cannot have moved farther than it would fall
-        broken = farthest > 0.5 * 9.8 * DURATION**2 * FAR
+        # nothing to compare with: a cloth cannot have moved farther than a free one
+        broken = farthest > FAR * case.farthest()
         return {**row, "verdict": VERDICTS[2 if broken else 1], "error": "", "cause": "far" * broken, "message": ""}
     error = size_of(position - reference[0]) / reference[1]
     broken = farthest > FAR * reference[1]
@@ -140,12 +176,12 @@ def judge(case: Case, method: str, count: int) -> dict[str, Any]:
     return {**row, "verdict": verdict, "error": error, "cause": "far" * broken, "message": ""}
 
 
-def explicit_limit(stretch: float) -> float:
+def explicit_limit(case: Case) -> float:
     """2/ω of the stiffest mode at rest, of the free cloth with its yarns locked [s]."""
     h, free = 1e-3, {"sliding": False, "wind": None, "pins": ()}
 
     def matrix(**options: Any) -> np.ndarray:
-        scene = Case(stretch=stretch).scene(**free, **options)
+        scene = case.scene(**free, **options)
         return wy.Simulator(scene, step=h, integrator="linear").system().dense()
 
     m = matrix(terms=["mass"])
@@ -166,32 +202,35 @@ def benchmark(maps: tuple[Case, ...], others: tuple[Case, ...], counts: tuple[in
 
 
 def draw(path: Path, rows: list[dict[str, Any]], maps: tuple[Case, ...], others: tuple[Case, ...]) -> None:
-    """A column of panels a method: the map above, the other factors below."""
+    """A column of panels a method: a map for each density above, the other factors below."""
     found = {(row["method"], *(row[f.name] for f in dataclasses.fields(Case)), row["step [s]"]): row for row in rows}
     steps = sorted({row["step [s]"] for row in rows})
-    figure = Figure(figsize=(1.0 + 3.4 * len(INTEGRATORS), 8.4), layout="constrained")
-    ratios = [len(maps), len(others)]
-    axes = figure.subplots(2, len(INTEGRATORS), squeeze=False, sharex=True, height_ratios=ratios)
+    groups = [tuple(cases) for _, cases in itertools.groupby(maps, key=lambda case: case.density)]
+    ratios = [*map(len, groups), len(others)]
+    figure = Figure(figsize=(1.0 + 3.4 * len(INTEGRATORS), 2.0 + 0.4 * sum(ratios)), layout="constrained")
+    axes = figure.subplots(len(ratios), len(INTEGRATORS), squeeze=False, sharex=True, height_ratios=ratios)
     for column, method in enumerate(INTEGRATORS):
-        for axis, cases in zip(axes[:, column], (maps, others), strict=True):
+        for axis, cases in zip(axes[:, column], (*groups, others), strict=True):
             panel(axis, [[found.get((method, *dataclasses.astuple(case), h)) for h in steps] for case in cases])
-            labels = [f"×{case.stretch:g}" if cases is maps else case.label() for case in cases]
+            labels = [case.label(others[0]) if cases is others else f"×{case.stretch:g}" for case in cases]
             axis.set_yticks(range(len(cases)), labels if column == 0 else [])
-        top = axes[0, column]
-        limits = [explicit_limit(case.stretch) for case in maps]
-        at = np.interp(np.log(limits), np.log(steps), np.arange(len(steps)), left=-0.5)
-        top.plot(at, range(len(maps)), "k.-", linewidth=1.0)
-        row = [case.stretch for case in maps].index(1.0)
-        top.add_patch(Rectangle((-0.48, row - 0.48), len(steps) - 0.04, 0.96, fill=False, linewidth=2.0))
-        top.set_title(f"{method} (order {INTEGRATORS[method].order})")
-        axes[1, column].set_xticks(range(len(steps)), [f"{1e3 * h:.2g}" for h in steps])
-        axes[1, column].set_xlabel("time step (ms)")
-    axes[0, 0].set_ylabel("stretch modulus (×1: the paper's)")
+        for axis, cases in zip(axes[:, column], groups, strict=False):
+            limits = [explicit_limit(case) for case in cases]
+            at = np.interp(np.log(limits), np.log(steps), np.arange(len(steps)), left=-0.5)
+            axis.plot(at, range(len(cases)), "k.-", linewidth=1.0)
+            if others[0] in cases:
+                row = cases.index(others[0])
+                axis.add_patch(Rectangle((-0.48, row - 0.48), len(steps) - 0.04, 0.96, fill=False, linewidth=2.0))
+        axes[0, column].set_title(f"{method} (order {INTEGRATORS[method].order})")
+        axes[-1, column].set_xticks(range(len(steps)), [f"{1e3 * h:.2g}" for h in steps])
+        axes[-1, column].set_xlabel("time step (ms)")
+    for axis, cases in zip(axes[:, 0], groups, strict=False):
+        axis.set_ylabel(f"stretch modulus\n(×1: of {cases[0].fabric})\ndensity ×{cases[0].density:g}")
     legend = [Patch(color=color, label=verdict) for verdict, color in zip(VERDICTS, COLORS, strict=True)]
     line = axes[0, 0].lines[0]
     line.set_label("an explicit method's limit, yarns locked")
-    unknown = Line2D([], [], color="k", marker="$?$", linestyle="", label="too large to compare")
-    left_out = Patch(facecolor="white", edgecolor="0.7", label="too large to run")
+    unknown = Line2D([], [], color="k", marker="$?$", linestyle="", label="nothing to compare with")
+    left_out = Patch(facecolor="white", edgecolor="0.7", label="too large or too stiff to run")
     figure.legend(handles=[*legend, line, unknown, left_out], loc="outside lower center", ncols=6, frameon=False)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
@@ -208,18 +247,37 @@ def panel(axis: Any, table: list[list[dict[str, Any] | None]]) -> None:
                 axis.text(i, j, text, ha="center", va="center", fontsize=7)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three steps, three moduli and small cloths alone")
+    parser.add_argument("--fabric", choices=FABRICS, default="paper", help="of the maps (%(default)s)")
+    text = "in the fabric's, a map for each (%(default)s)"
+    parser.add_argument("--densities", type=float, nargs="+", default=list(DENSITY), metavar="X", help=text)
     parser.add_argument("--png", type=Path, default=Path("docs/stability.png"), help="(%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "stability.csv", help="CSV file (%(default)s)")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     one_core()
     wp.config.log_level = wp.LOG_WARNING
-    maps, others, counts = tuple(Case(stretch=s) for s in STRETCH), OTHERS, COUNTS
+    stretch, others, counts = STRETCH, OTHERS, COUNTS
     if options.quick:
-        maps, counts = maps[::2], COUNTS[2::2]
+        stretch, counts = STRETCH[::2], COUNTS[2::2]
         others = tuple(case for case in others if case.size < 17)
+    usual = Case(fabric=options.fabric)
+    maps = tuple(
+        dataclasses.replace(usual, stretch=s, density=d) for d, s in itertools.product(options.densities, stretch)
+    )
+    # the usual one first; a fabric that is set apart by itself stays
+    others = tuple(
+        dict.fromkeys(
+            (
+                usual,
+                *(
+                    case if case.fabric != "paper" else dataclasses.replace(case, fabric=options.fabric)
+                    for case in others
+                ),
+            )
+        )
+    )
     about = environment("matplotlib")
     rows = benchmark(maps, others, counts)
     write_csv(options.output, rows, about)

@@ -1,6 +1,6 @@
 """Steps that follow the error against even ones: what each is off, and what it takes.
 
-    python benchmarks/step_control.py [--size 17] [--motions hung snap pull] [--repeats 9]
+    python benchmarks/step_control.py [--size 17] [--motions hung snap pull] [--fabric cotton] [--repeats 9]
 
 The default method makes the motions of ``motions.py`` in even steps, and as one step in parts (``Simulator(...,
 step_error=...)``) that begin with 1 ms. Error as of chart 1 (``work_precision.py``). Wall times are of all the motion's
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, turns, write_csv
-from motions import MOTIONS, Motion
+from motions import Motion, add_options, find
 from work_precision import end, reference
 
 import warp_yarn as wy
@@ -55,7 +55,7 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
         runs.append((motion.simulator(size, step=motion.duration, step_error=allowed), 1))
     makes = [made(*run) for run in runs]
     for (simulator, count), make in zip(runs, makes, strict=True):
-        row = {"motion": name, "size": f"{size} × {size}", "step error": simulator.step_error or "even"}
+        row = {"motion": name, **motion.about(size), "step error": simulator.step_error or "even"}
         row["error"] = converged.error(make())
         parts = simulator.parts
         row |= {"steps": count, "rejected": 0} if count > 1 else {"steps": parts.made, "rejected": parts.rejected}
@@ -82,7 +82,7 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=17, help="rows and columns (%(default)s)")
-    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS), help="(all)")
+    add_options(parser)
     parser.add_argument("--repeats", type=int, default=9, help="turns (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "step_control.csv", help="CSV file (%(default)s)")
     options = parser.parse_args(arguments)
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     table = []
     for name in options.motions:
-        table += rows(MOTIONS[name], name, options.size, options.repeats)
+        table += rows(find(name, options.fabric), name, options.size, options.repeats)
         print_table(table[-len(COUNTS) - len(STEP_ERRORS) :])
     write_csv(options.output, table, about)
     print("written:", options.output)

@@ -1,6 +1,6 @@
 """Chart 4, what each term costs and what it changes: the motions of ``motions.py`` with terms left out one at a time.
 
-    python benchmarks/terms.py [--size 17] [--motions hung snap pull] [--repeats 7] [--step 5e-4]
+    python benchmarks/terms.py [--size 17] [--motions hung snap pull] [--fabric cotton] [--step 5e-4]
 
 A row says how far leaving a term out moves the cloth (root mean square over nodes and frames, relative to the
 displacement) and which part of the step's time that saves (all of the motion, in turn with the whole scene, median of
@@ -22,7 +22,7 @@ import warp as wp
 from common import RESULTS, environment, one_core, print_table, write_csv
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from motions import MOTIONS
+from motions import Motion, add_options, find
 from plots import COLORS, MARKERS, PICTURES, save
 
 from warp_yarn.ablation import Ablation, ablate
@@ -34,14 +34,13 @@ CHEAPEST = -60.0
 """Where bars end of terms without which a step takes much longer [%]; their numbers are written beside them."""
 
 
-def benchmark(name: str, size: int, step: float, repeats: int) -> Ablation:
+def benchmark(motion: Motion, size: int, step: float, repeats: int) -> Ablation:
     """One motion, with the simulator's default method."""
-    motion = MOTIONS[name]
     start = motion.simulator(size, step=step).state
-    return ablate(motion.scene(size), steps=motion.steps(step), step=step, repeats=repeats, start=start)
+    return ablate(motion.scene(size, step), steps=motion.steps(step), step=step, repeats=repeats, start=start)
 
 
-def rows(name: str, size: int, step: float, found: Ablation) -> list[dict[str, Any]]:
+def rows(motion: Motion, name: str, size: int, step: float, found: Ablation) -> list[dict[str, Any]]:
     changes = [*found.changes, *([found.together] if found.together else [])]
     result = []
     for change in changes:
@@ -49,7 +48,7 @@ def rows(name: str, size: int, step: float, found: Ablation) -> list[dict[str, A
         result.append(
             {
                 "motion": name,
-                "size": f"{size} × {size}",
+                **motion.about(size),
                 "step [ms]": 1e3 * step,
                 "whole step takes [ms]": 1e3 * found.seconds,
                 "left out": change.name,
@@ -64,7 +63,7 @@ def rows(name: str, size: int, step: float, found: Ablation) -> list[dict[str, A
     return result
 
 
-def draw(found: dict[str, Ablation], size: int, step: float) -> Figure:
+def draw(found: dict[str, Ablation], motions: dict[str, Motion], size: int, step: float) -> Figure:
     names = list(dict.fromkeys(change.name for ablation in found.values() for change in ablation.changes))
     figure = Figure(figsize=(10.0, 1.5 + 0.45 * len(names)), layout="constrained")
     moved_axes, cost_axes = figure.subplots(1, 2, sharey=True)
@@ -97,20 +96,22 @@ def draw(found: dict[str, Ablation], size: int, step: float) -> Figure:
     for axes in (moved_axes, cost_axes):
         axes.grid(axis="x", alpha=0.3)
     legend = {
-        MOTIONS[name].title: Line2D([], [], color=COLORS[k], marker=MARKERS[k], linestyle="")
+        f"{motions[name].title} ({motions[name].fabric})": Line2D(
+            [], [], color=COLORS[k], marker=MARKERS[k], linestyle=""
+        )
         for k, name in enumerate(found)
     }
     legend["half the step changes as much"] = Line2D([], [], color="0.2", linestyle="--", linewidth=1.0)
     legend["fails without it"] = Line2D([], [], color="0.2", marker="x", linestyle="")
-    figure.legend(legend.values(), legend, loc="outside lower center", ncols=len(legend), fontsize=9)
-    figure.suptitle(f"What each term costs and changes, {size} × {size} yarns, steps of {1e3 * step:g} ms")
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=min(len(legend), 4), fontsize=9)
+    figure.suptitle(f"What each term costs and changes, {size} yarns across, steps of {1e3 * step:g} ms")
     return figure
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=17, help="rows and columns (%(default)s)")
-    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS), help="(all)")
+    add_options(parser)
     parser.add_argument("--step", type=float, default=5e-4, metavar="SECONDS", help="time step (%(default)g)")
     parser.add_argument("--repeats", type=int, default=7, help="timed runs (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "terms.csv", help="CSV file (%(default)s)")
@@ -121,15 +122,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     about = environment("matplotlib")
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     found, table = {}, []
-    for name in options.motions:
-        found[name] = benchmark(name, options.size, options.step, options.repeats)
-        table += rows(name, options.size, options.step, found[name])
-        print(f"\n{MOTIONS[name].title}, {1e3 * found[name].seconds:.3g} ms a step")
+    motions = {name: find(name, options.fabric) for name in options.motions}
+    for name, made in motions.items():
+        found[name] = benchmark(made, options.size, options.step, options.repeats)
+        table += rows(made, name, options.size, options.step, found[name])
+        print(f"\n{made.title}, {made.fabric}, {1e3 * found[name].seconds:.3g} ms a step")
         print("\n".join(found[name].lines()), flush=True)
     print()
     print_table([{name: value for name, value in row.items() if name != "failure"} for row in table])
     write_csv(options.output, table, about)
-    save(draw(found, options.size, options.step), options.plot)
+    save(draw(found, motions, options.size, options.step), options.plot)
     print("written:", options.output, options.plot)
 
 

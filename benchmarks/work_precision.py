@@ -1,14 +1,15 @@
 """Chart 1, work and precision: how far each time-stepping method is off, against what it costs.
 
-    python benchmarks/work_precision.py [--size 17] [--motions hung snap pull] [--repeats 3] [--longest 1.5]
+    python benchmarks/work_precision.py [--size 17] [--motions hung snap pull] [--fabric cotton] [--repeats 3]
 
 Every method of the registry, in both precisions and at several solver tolerances, makes the motions of ``motions.py``
 at ever smaller steps, until it is 0.02 % off or nearly as good as the reference, or a run takes --longest seconds.
 
 Error: the root mean square over the nodes of the distance of their positions at the end of the motion to converged
-ones, over that of their displacement from its beginning. Time: of a run of the whole motion, divided by what it
-simulates; the median of the repeats, on one core. Loading or compiling kernels, capturing graphs and two steps come
-before and are in a column of their own. A tolerance is that of the conjugate gradient and of Newton's iteration alike.
+ones, over that of their displacement from its beginning (``Motion.moved``). Time: of a run of the whole motion, divided
+by what it simulates; the median of the repeats, on one core. Loading or compiling kernels, capturing graphs and two
+steps come before and are in a column of their own. A tolerance is that of the conjugate gradient and of Newton's
+iteration alike.
 
 Converged: the second-order method at three halving steps, extrapolated: the powers p and p + 1 of the step are taken
 out of the error. How far that is from the same by another method (of second order too where one agrees) is how far the
@@ -36,7 +37,7 @@ import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, write_csv
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from motions import MOTIONS, Motion, distance
+from motions import Motion, add_options, distance, find
 from plots import COLORS, MARKERS, PICTURES, save
 
 import warp_yarn as wy
@@ -123,7 +124,7 @@ def reference(motion: Motion, size: int) -> Reference:
     """The converged motion by the reference method, checked by another: the first that is near enough for the
     targets, or else the nearest."""
     position = converged(motion, size, REFERENCE)
-    moved = distance(position, motion.scene(size).cloth.position)
+    moved = motion.moved(position, size)
     best = None
     for method in checks():
         try:
@@ -161,11 +162,18 @@ class Curve:
     method: str
     precision: str
     tolerance: float | None
+    fabric: str | None = None
+
+    @property
+    def made(self) -> Motion:
+        """The motion, of its fabric."""
+        return find(self.motion, self.fabric)
 
     @property
     def columns(self) -> dict[str, Any]:
         return {
             "motion": self.motion,
+            "fabric": self.made.fabric,
             "method": self.method,
             "precision": self.precision,
             "tolerance": "default" if self.tolerance is None else f"{self.tolerance:.0e}",
@@ -173,7 +181,7 @@ class Curve:
 
     def simulator(self, size: int, step: float) -> wy.Simulator:
         options = {"tolerance": self.tolerance, "newton_tolerance": self.tolerance, "precision": self.precision}
-        return MOTIONS[self.motion].simulator(size, step=step, integrator=self.method, **options)
+        return self.made.simulator(size, step=step, integrator=self.method, **options)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,7 +220,7 @@ class Point:
 
 def point(curve: Curve, size: int, step: float, converged: Reference, repeats: int) -> Point:
     """Runs of a curve at one step size."""
-    motion = MOTIONS[curve.motion]
+    motion = curve.made
     begin = time.perf_counter()
     simulator = curve.simulator(size, step)
     beginning = simulator.state
@@ -236,7 +244,7 @@ def point(curve: Curve, size: int, step: float, converged: Reference, repeats: i
 
 def points(curve: Curve, size: int, converged: Reference, repeats: int, longest: float) -> list[Point]:
     """All of a curve, from the largest step down."""
-    duration, result = MOTIONS[curve.motion].duration, []
+    duration, result = curve.made.duration, []
     for step in STEPS:
         result.append(point(curve, size, step, converged, repeats))
         last = result[-1]
@@ -306,12 +314,17 @@ def summary(found: dict[Curve, list[Point]], floor: float) -> list[dict[str, Any
 
 
 def draw(found: dict[Curve, list[Point]], references: dict[str, Reference], size: int) -> Figure:
-    """A panel for each motion."""
+    """A panel for each motion, four in a row."""
     look = {name: (COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]) for k, name in enumerate(INTEGRATORS)}
     tolerances = sorted({curve.tolerance for curve in found if curve.tolerance is not None}, reverse=True)
     dashes = {tolerance: (":", "--", "-.")[k % 3] for k, tolerance in enumerate(tolerances)}
-    figure = Figure(figsize=(5.2 * len(references), 6.0), layout="constrained")
-    panels = figure.subplots(1, len(references), sharey=True, squeeze=False)[0]
+    across = min(len(references), 4)
+    down = -(-len(references) // across)
+    figure = Figure(figsize=(5.2 * across, 6.0 * down), layout="constrained")
+    grid = figure.subplots(down, across, sharey=True, squeeze=False).ravel()
+    panels = grid[: len(references)]
+    for axes in grid[len(references) :]:
+        axes.remove()
     for axes, (name, converged) in zip(panels, references.items(), strict=True):
         failed, slopes = [], []
         for curve, points in found.items():
@@ -353,14 +366,16 @@ def draw(found: dict[Curve, list[Point]], references: dict[str, Reference], size
             at = min(max(seconds, limits[0] * 1.05), limits[1] / 1.05)
             axes.plot(at, 0.97, "x", color=color, transform=axes.get_xaxis_transform())
         axes.set_xlim(limits)
-        axes.set_title(MOTIONS[name].title)
+        made = next(curve.made for curve in found if curve.motion == name)
+        axes.set_title(f"{made.title}: {made.fabric}, {made.about(size)['size']}")
         axes.set_xlabel("wall time per simulated second [s]")
         axes.grid(which="major", alpha=0.3)
         for target in TARGETS:
             axes.axhline(target, color="0.4", linewidth=0.8, linestyle=(0, (1, 3)))
         handles, labels = zip(*slopes, strict=True)
         axes.legend(handles, labels, title="slope of error over step", fontsize=8, title_fontsize=8, loc="lower left")
-    panels[0].set_ylabel("position error, relative to the motion")
+    for axes in panels[::across]:
+        axes.set_ylabel("position error, relative to the motion")
     # room below for the legend, above for what failed
     lowest, highest = min(axes.dataLim.y0 for axes in panels), max(axes.dataLim.y1 for axes in panels)
     panels[0].set_ylim(lowest / 50.0, 3.0 * highest)
@@ -377,16 +392,16 @@ def draw(found: dict[Curve, list[Point]], references: dict[str, Reference], size
         },
     }
     figure.legend(
-        styles.values(), styles, loc="outside lower center", ncols=min(len(styles), 2 * len(references) + 2), fontsize=9
+        styles.values(), styles, loc="outside lower center", ncols=min(len(styles), 2 * across + 2), fontsize=9
     )
-    figure.suptitle(f"Work and precision, {size} × {size} yarns, one core")
+    figure.suptitle("Work and precision, one core")
     return figure
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=17, help="rows and columns (%(default)s)")
-    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS), help="(all)")
+    add_options(parser)
     parser.add_argument("--repeats", type=int, default=3, help="timed runs (%(default)s)")
     parser.add_argument("--longest", type=float, default=1.5, metavar="SECONDS", help="of one run (%(default)g)")
     parser.add_argument("--output", type=Path, default=RESULTS / "work_precision.csv", help="CSV file (%(default)s)")
@@ -399,10 +414,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows, found, references, sums = [], {}, {}, []
     for name in options.motions:
         begin = time.perf_counter()
-        converged = reference(MOTIONS[name], options.size)
+        made = find(name, options.fabric)
+        about_it = made.about(options.size)
+        converged = reference(made, options.size)
         references[name] = converged
         print(
-            f"\n{name}: {MOTIONS[name].title}, {options.size} × {options.size}, {1e3 * MOTIONS[name].duration:g} ms, "
+            f"\n{name}: {made.title}, {made.fabric}, {about_it['size']}, {1e3 * made.duration:g} ms, "
             f"moved by {1e3 * converged.moved:.3g} mm; reference by {REFERENCE}, {converged.uncertainty:.1e} of that "
             f"from {converged.check}'s: errors from {converged.floor:.1e} on are charted "
             f"(made in {time.perf_counter() - begin:.0f} s)"
@@ -410,20 +427,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         mine = {}
         for method, (precision, tolerances) in itertools.product(INTEGRATORS, CURVES.items()):
             for tolerance in tolerances:
-                curve = Curve(name, method, precision, tolerance)
+                curve = Curve(name, method, precision, tolerance, options.fabric)
                 mine[curve] = points(curve, options.size, converged, options.repeats, options.longest)
                 checked = {"check": converged.check, "reference uncertainty": converged.uncertainty}
-                size = {"size": f"{options.size} × {options.size}", "order": INTEGRATORS[method].order}
+                size = {"size": about_it["size"], "order": INTEGRATORS[method].order}
                 rows += [{**curve.columns, **size, **p.columns(converged.floor), **checked} for p in mine[curve]]
         sums += summary(mine, converged.floor)
         print_table(sums[-len(mine) :])
         found |= mine
     for row in rows:
         if row["failure"]:
-            print(
-                f"failed: {row['motion']}, {row['method']}, {row['precision']}, step {row['step [ms]']:g} ms: ", end=""
-            )
-            print(row["failure"])
+            which = ", ".join(row[name] for name in ("motion", "fabric", "method", "precision"))
+            print(f"failed: {which}, step {row['step [ms]']:g} ms: {row['failure']}")
     write_csv(options.output, rows, about)
     summary_file = options.output.with_stem(options.output.stem + "_summary")
     write_csv(summary_file, sums, about)

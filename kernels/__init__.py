@@ -1,6 +1,7 @@
 """What runs on the device, pure Warp: one file a physical effect, one for the solver, one for the step around it.
 
-Installed as ``warp_yarn.kernels``. A new effect is a new file with its ``TERM``, and one line here.
+Installed as ``warp_yarn.kernels``. A new effect is a new file with its ``TERM``, and one line here; ``CONTRIBUTING.md``
+has the rest.
 """
 
 import functools
@@ -58,8 +59,10 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
-    # but not the contact: nodes on one line have products that cancel to the last digit
     variant.fuse("terms")
+    # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does by itself, one
+    # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
+    wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
     kernels = {"contact_normal": contact.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
     for term in TERMS.values():
         kernels[term.name] = term.define(variant)

@@ -1,6 +1,7 @@
-"""The paper's cloth, hung by its two top corners, in a wind: simulated and written as a USD file.
+"""A cloth, hung by its two top corners, in a wind: simulated and written as a USD file.
 
-python scenes/hang.py                                     17 × 17, plain, 500 steps of 1 ms: out/hang.usdc
+python scenes/hang.py                                     the paper's, 17 × 17, plain, 500 × 1 ms: out/hang.usdc
+python scenes/hang.py --fabric handkerchief               one that you might have at hand
 python scenes/hang.py --size 31 --weave twill --yarns 1 3 --png out/hang.png --mp4 out/hang.mp4
 python scenes/hang.py --record out/hang.npz               and later, to go on from there:
 python scenes/hang.py --resume out/hang.npz --steps 500 --output out/both.usdc
@@ -18,9 +19,10 @@ from common import Run, add_slowdown, command, file_ending, make_folders, simula
 
 import warp_yarn as wy
 from warp_yarn import paper
+from warp_yarn.fabrics import FABRICS
 from warp_yarn.usd import ENDINGS
 
-OF_THE_RECORDING = ("size", "rows", "columns", "weave", "yarns", "step")
+OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "yarns", "step")
 """Options that a recording settles, where one is resumed."""
 
 
@@ -29,6 +31,7 @@ def parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     add = result.add_argument
+    add("--fabric", choices=FABRICS, help="(paper)")
     add("--size", type=int, metavar="N", help="rows and columns (17)")
     add("--rows", type=int, help="number of warp yarns, at least 3")
     add("--columns", type=int, help="number of weft yarns, at least 3")
@@ -77,7 +80,11 @@ def chosen(options: argparse.Namespace) -> tuple[wy.Cloth, float]:
     rows = size if options.rows is None else options.rows
     columns = size if options.columns is None else options.columns
     step = paper.STEP if options.step is None else options.step
-    return paper.cloth(options.weave or "plain", rows, columns, options.yarns or (1, 2)), step
+    fabric = options.fabric or "paper"
+    if options.yarns is not None and fabric != "paper":
+        raise wy.InputError(f"--yarns = {' '.join(map(str, options.yarns))} are the paper's: not of --fabric {fabric}")
+    yarns = {} if options.yarns is None else {"yarns": options.yarns}
+    return FABRICS[fabric](weave=options.weave or "plain", rows=rows, columns=columns, **yarns), step
 
 
 def recorded(options: argparse.Namespace, earlier: wy.Trajectory) -> tuple[wy.Cloth, float]:

@@ -1,6 +1,7 @@
 """What a scene does not need: how far each term, and sliding, moves the cloth, and what it costs.
 
 python scenes/terms.py                        the paper's 17 × 17 cloth in the wind, 50 steps of 0.5 ms
+python scenes/terms.py --fabric cotton        the same of another fabric
 python scenes/terms.py my_scene.py --step 1e-3 --steps 200
 
 The file is Python, and sets `scene` to a warp_yarn.Scene (and `state` to a warp_yarn.State to start from, if it likes):
@@ -27,6 +28,7 @@ import warp_yarn as wy
 from warp_yarn import paper
 from warp_yarn.ablation import Ablation, ablate
 from warp_yarn.errors import whole
+from warp_yarn.fabrics import FABRICS
 from warp_yarn.integrators import INTEGRATORS
 
 
@@ -35,8 +37,9 @@ def parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     add = result.add_argument
-    add("file", nargs="?", type=Path, help="a Python file that sets `scene`; none: the paper's hung cloth")
-    add("--size", type=int, metavar="N", help="rows and columns of the paper's cloth (17)")
+    add("file", nargs="?", type=Path, help="a Python file that sets `scene`; none: a hung cloth in a wind")
+    add("--fabric", choices=FABRICS, help="of the hung cloth (paper)")
+    add("--size", type=int, metavar="N", help="rows and columns of the hung cloth (17)")
     add("--steps", type=int, default=50, help="how many (%(default)s)")
     add("--step", type=float, default=5e-4, metavar="SECONDS", help="time step (%(default)g)")
     add("--integrator", choices=INTEGRATORS, help="(the simulator's default)")
@@ -66,9 +69,10 @@ def chosen(options: argparse.Namespace) -> tuple[wy.Scene, wy.State | None]:
     """The scene that the options name, and where it starts."""
     if options.file is None:
         size = 17 if options.size is None else options.size
-        return paper.hung_cloth(rows=size, columns=size), None
-    if options.size is not None:
-        raise wy.InputError(f"--size does not go with a file: {options.file} has its own cloth")
+        return paper.hung(FABRICS[options.fabric or "paper"](rows=size, columns=size)), None
+    for name in ("fabric", "size"):
+        if getattr(options, name) is not None:
+            raise wy.InputError(f"--{name} does not go with a file: {options.file} has its own cloth")
     if not options.file.is_file():
         raise wy.InputError(f"{options.file}: there is no such file")
     names = runpy.run_path(str(options.file))

@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 import warp_yarn as wy
 import warp_yarn.torch as wt
 from warp_yarn.errors import finite_array, number, whole
+from warp_yarn.fabrics import FABRICS
 from warp_yarn.files import whole_file
 from warp_yarn.usd import ENDINGS
 
@@ -205,6 +206,7 @@ def parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     add = result.add_argument
+    add("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     add("--size", type=int, default=9, metavar="N", help="rows and columns (%(default)s)")
     add("--weave", choices=wy.WEAVES, default="plain", help="(%(default)s)")
     add("--target", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0.3, 0.1, 0.2), help="m (0.3 0.1 0.2)")
@@ -239,8 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     number("--rate", options.rate, above=0.0)
     number("--within", options.within, least=0.0)
     make_folders([options.output, options.plot, options.result])
-    plain = wy.paper.cloth(options.weave, options.size, options.size)
-    cloth = wy.Cloth(plain.weave, yarns=plain.yarns, shear=plain.shear, pose="flat")
+    make = FABRICS[options.fabric]
+    cloth = make(weave=options.weave, rows=options.size, columns=options.size, pose="flat")
     throw = Throw(
         cloth,
         options.target,

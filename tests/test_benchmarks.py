@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -20,13 +21,14 @@ sizes = load("benchmarks/sizes.py")
 bandwidth = load("benchmarks/bandwidth.py")
 terms = load("benchmarks/terms.py")
 terms_scene = load("scenes/terms.py")
+motions = sys.modules["motions"]
 
 
 @pytest.fixture(autouse=True)
 def on_all_cores(monkeypatch):
     """The tests' own process keeps its cores."""
     monkeypatch.setattr(bandwidth, "cores", lambda count: None)
-    for module in (work, sizes, terms):
+    for module in (work, equal, control, sizes, terms):
         monkeypatch.setattr(module, "one_core", lambda: None)
 
 
@@ -45,12 +47,12 @@ def test_ours_and_scipy_solve_the_same_system_to_the_same_tolerance():
 
 
 def test_a_row_reaches_the_csv_file_with_the_environment(tmp_path):
-    row = solver.benchmark(3, repeats=1)
+    row = solver.benchmark(3, repeats=1, fabric="cotton")
     path = tmp_path / "results" / "solver.csv"
     solver.write_csv(path, [row], solver.environment("scipy"))
     with open(path, newline="") as file:
         (read,) = csv.DictReader(file)
-    assert read["size"] == "3 × 3"
+    assert (read["fabric"], read["size"]) == ("cotton", "3 × 3")
     # 9 nodes of 3 unknowns, one crossing of 2
     assert read["unknowns"] == "29"
     assert float(read["scipy [ms]"]) > 0.0
@@ -100,19 +102,19 @@ def test_the_time_to_an_error_is_where_a_curve_stays_below_it():
     assert work.time_to([], 0.02) is None
 
 
-SHORT = dataclasses.replace(work.MOTIONS["hung"], duration=5e-3, finest=1e-3 / 128)
+SHORT = dataclasses.replace(motions.MOTIONS["hung"], duration=5e-3, finest=1e-3 / 128)
 """The hung cloth for 5 ms: smooth, and every method is soon near."""
 
 
 def test_steps_fit_into_the_motions():
-    for motion in work.MOTIONS.values():
+    for motion in motions.MOTIONS.values():
         assert all(motion.steps(step) * step == pytest.approx(motion.duration) for step in work.STEPS)
     with pytest.raises(wy.InputError, match="whole times"):
         SHORT.steps(3e-3)
 
 
 def test_two_methods_agree_on_the_reference(monkeypatch):
-    monkeypatch.setitem(work.MOTIONS, "hung", SHORT)
+    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
     found = work.reference(SHORT, 4)
     assert found.check in work.INTEGRATORS
     assert found.check != work.REFERENCE
@@ -130,7 +132,7 @@ def test_two_methods_agree_on_the_reference(monkeypatch):
 
 def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
     # squares of such velocities are not finite
-    monkeypatch.setitem(work.MOTIONS, "hung", dataclasses.replace(SHORT, speed=(0.0, 0.0, 1e200)))
+    monkeypatch.setitem(motions.MOTIONS, "hung", dataclasses.replace(SHORT, speed=(0.0, 0.0, 1e200)))
     curve = work.Curve("hung", "linear", "double", None)
     converged = work.Reference(np.zeros((16, 3)), 1.0, "none", 1e-5)
     failed = work.point(curve, 4, 1e-3, converged, repeats=1)
@@ -146,8 +148,9 @@ def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
     assert any(line.get_marker() == "x" for line in drawn.axes[0].lines)
 
 
+@pytest.mark.slow
 def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(work.MOTIONS, "hung", SHORT)
+    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
     monkeypatch.setattr(work, "STEPS", (1e-3, 5e-4, 2.5e-4))
     output, plot = tmp_path / "wp.csv", tmp_path / "wp.png"
     work.main(["--size", "3", "--motions", "hung", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
@@ -162,13 +165,91 @@ def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
     assert "of that from" in capsys.readouterr().out
 
 
+# -- benchmarks/motions.py --------------------------------------------------------------------------------------------
+
+EXACT = work.EXACT
+"""Tolerances near rounding."""
+norm = np.linalg.norm
+
+
+@pytest.mark.parametrize("fabric", [None, *wy.fabrics.FABRICS])
+@pytest.mark.parametrize("name", motions.MOTIONS)
+def test_a_motion_is_made_of_any_fabric(name, fabric):
+    motion = motions.find(name, fabric)
+    assert motion.fabric == fabric or fabric is None
+    simulator = motion.simulator(5, step=1e-3, **EXACT)
+    assert simulator.scene.cloth.yarns == wy.fabrics.FABRICS[motion.fabric]().yarns
+    assert motion.about(5) == {"fabric": motion.fabric, "size": "5 × 5"}
+    position = work.end(simulator, 2)
+    moved = position - motion.cloth(5).position - 2e-3 * np.array(motion.speed)
+    # 2 ms of gravity and wind, or of spinning at 37 rad/s 3 mm from the centre: some 2e-4 m
+    assert 1e-9 < np.abs(moved).max() < 3e-3
+
+
+def test_a_throw_flies_as_a_free_body_does():
+    """Its centre of mass on a parabola, its angular momentum about it that of the beginning."""
+    motion, h = motions.find("throw"), 5e-4
+    simulator = motion.simulator(5, step=h, **EXACT)
+    trajectory = simulator.run(20)
+    t = h * np.arange(21)[:, None]
+    ends = np.array([0.5, 1.0, 1.0, 1.0, 0.5])
+    # a segment's mass, half at each of its ends: two yarns cross at a node inside, and an edge has half of each
+    weight = (ends[:, None] + ends[None, :]).ravel()[:, None]
+    centre, momentum = ((weight * x).sum(axis=1) / weight.sum() for x in (trajectory.position, trajectory.velocity))
+    # rounding and the tolerances; at constant acceleration a second-order method is exact
+    np.testing.assert_allclose(momentum, motion.speed + t * [0.0, 0.0, -9.8], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(centre, centre[0] + t * motion.speed - 4.9 * t**2 * [0, 0, 1], rtol=0, atol=1e-8)
+    about = trajectory.position - centre[:, None], trajectory.velocity - momentum[:, None]
+    angular = (weight * np.cross(*about)).sum(axis=1)
+    # but for lumping, which is not the model's mass matrix, and for the step
+    assert norm(angular - angular[0], axis=1).max() < 0.01 * norm(angular[0])
+    # it has turned by 0.37 radians of the 37 a second: the far corners by a third of their distance
+    turned = trajectory.position[-1, 0] - trajectory.position[-1, -1]
+    cosine = turned @ (trajectory.position[0, 0] - trajectory.position[0, -1]) / norm(turned) ** 2
+    assert 0.1 < np.arccos(cosine) < 0.5
+
+
+def test_a_carried_cloth_moves_as_one_that_is_not():
+    """Seen from the hand, which moves on evenly within every step."""
+    still, carried = motions.find("drop"), motions.find("carried")
+    ends = [motion.simulator(5, step=1e-3, **EXACT).run(10).position for motion in (still, carried)]
+    rows = np.arange(11)[:, None, None] * 1e-3 * np.array(carried.speed)
+    fallen = np.abs(ends[0] - ends[0][0]).max()
+    assert fallen > 1e-4
+    # the tolerances are relative to velocities, here a hundred times those of the inner motion
+    np.testing.assert_allclose(ends[1] - rows, ends[0], rtol=0, atol=1e-3 * fallen)
+    assert carried.moved(ends[1][-1] + 0.04 * np.array(carried.speed), 5) == pytest.approx(
+        still.moved(ends[0][-1], 5), rel=1e-3
+    )
+
+
+def test_a_clamped_strip_bends_down_from_its_clamp():
+    motion = motions.find("strip")
+    assert motion.about(9) == {"fabric": "cotton", "size": "5 × 9"}
+    moved = motion.simulator(9, step=1e-3, **EXACT).run(3).position - motion.cloth(9).position
+    down = -moved[-1, :, 2].reshape(5, 9)
+    assert not moved[:, np.concatenate([9 * np.arange(5), 9 * np.arange(5) + 1])].any()
+    assert (np.diff(down[2, 1:]) > 0.0).all()
+    # less than it would fall
+    assert down.max() < 4.9 * 3e-3**2
+
+
+def test_a_carried_cloth_has_the_path_of_half_the_step():
+    motion = motions.find("carried")
+    half = ablation._halved(motion.scene(4, 1e-3), None)
+    np.testing.assert_allclose(half.pin_path, motion.scene(4, 5e-4).pin_path, rtol=0, atol=1e-15)
+    moved = motion.simulator(4, step=1e-3).state
+    moved.position += 1.0
+    assert (ablation._halved(motion.scene(4, 1e-3), moved).pin_path[0] > half.pin_path[0]).all()
+
+
 # -- benchmarks/equal_error.py ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order, target", [(1, 1e-2), (2, 1e-3), (1, 1.0)])
 def test_the_largest_step_that_reaches_an_error_is_found(monkeypatch, order, target):
     monkeypatch.setattr(equal, "error", lambda motion, size, method, steps, converged: (2.0 / steps) ** order)
-    motion = equal.MOTIONS["hung"]
+    motion = motions.MOTIONS["hung"]
     found, never = equal.steps_to(motion, 5, "linear", (target, 1e-9), None)
     # 3 % more steps than needed at most, or one; 25 ms begin with 5 steps
     needed = max(5.0, 2.0 / target ** (1.0 / order))
@@ -177,19 +258,36 @@ def test_the_largest_step_that_reaches_an_error_is_found(monkeypatch, order, tar
 
 
 def test_methods_are_timed_beside_each_other():
-    motion = equal.MOTIONS["hung"]
+    motion = motions.MOTIONS["hung"]
     seconds = equal.side_by_side(motion, 3, {"linear": 50, "sdirk2": 5}, repeats=2)
     assert [len(times) for times in seconds.values()] == [2, 2]
     assert min(map(min, seconds.values())) > 0.0
+
+
+def test_equal_error_from_the_command(monkeypatch, tmp_path):
+    monkeypatch.setattr(equal, "reference", lambda motion, size: None)
+    # the last method never gets there
+    last = list(equal.INTEGRATORS)[-1]
+    monkeypatch.setattr(equal, "steps_to", lambda motion, size, method, *_: [2, None] if method == last else [2, 4])
+    output = tmp_path / "e.csv"
+    chosen = ["--motions", "hung", "strip", "--sizes", "3", "4", "--fabric", "handkerchief"]
+    equal.main([*chosen, "--repeats", "1", "--output", str(output)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    kinds = [("hung", "3 × 3"), ("hung", "4 × 4"), ("strip", "5 × 3"), ("strip", "5 × 4")]
+    assert list(dict.fromkeys((row["motion"], row["size"]) for row in rows)) == kinds
+    assert len(rows) == len(kinds) * len(equal.TARGETS) * len(equal.INTEGRATORS)
+    assert {row["fabric"] for row in rows} == {"handkerchief"}
+    assert {row["method"] for row in rows if row["of eq. 2's"] == ""} == {last}
 
 
 # -- benchmarks/step_control.py ---------------------------------------------------------------------------------------
 
 
 def test_parts_are_compared_with_even_steps_of_their_error(monkeypatch):
-    motion = control.MOTIONS["hung"]
+    motion = motions.MOTIONS["hung"]
     position = control.end(motion.simulator(3, step=2.5e-4), 100)
-    moved = work.distance(position, motion.scene(3).cloth.position)
+    moved = motion.moved(position, 3)
     monkeypatch.setattr(control, "reference", lambda motion, size: work.Reference(position, moved, "", 0.0))
     monkeypatch.setattr(control, "COUNTS", (5, 80))
     monkeypatch.setattr(control, "STEP_ERRORS", (1e-2, 1e-3))
@@ -204,6 +302,20 @@ def test_parts_are_compared_with_even_steps_of_their_error(monkeypatch):
         assert row["of even's"] == pytest.approx(20.0 / (5.0 * 16.0**share))
 
 
+def test_step_control_from_the_command(monkeypatch, tmp_path):
+    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
+    monkeypatch.setattr(control, "COUNTS", (5, 20))
+    monkeypatch.setattr(control, "STEP_ERRORS", (1e-2,))
+    end = work.end(SHORT.simulator(3, step=1e-4), 50)
+    monkeypatch.setattr(control, "reference", lambda motion, size: work.Reference(end, 1e-4, "", 0.0))
+    output = tmp_path / "c.csv"
+    control.main(["--size", "3", "--motions", "hung", "--fabric", "paper", "--repeats", "1", "--output", str(output)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["step error"] for row in rows] == ["even", "even", "0.01"]
+    assert {(row["fabric"], row["size"]) for row in rows} == {("paper", "3 × 3")}
+
+
 # -- benchmarks/sizes.py ----------------------------------------------------------------------------------------------
 
 
@@ -216,18 +328,22 @@ def test_array_bytes_counts_each_memory_once():
     assert sizes.array_bytes(simulator) == counted + 7 * 24
 
 
+@pytest.mark.slow
 def test_chart_2_from_the_command(monkeypatch, tmp_path, capsys):
     # in this process: its memory says nothing
     monkeypatch.setattr(sizes, "apart", sizes.measured)
     monkeypatch.setattr(sizes, "LARGE", 3)
     output, plot = tmp_path / "s.csv", tmp_path / "s.png"
-    sizes.main(["--sizes", "3", "5", "--steps", "1", "--output", str(output), "--plot", str(plot)])
+    sizes.main(
+        ["--sizes", "3", "5", "--steps", "1", "--fabric", "cotton", "--output", str(output), "--plot", str(plot)]
+    )
     with open(output, newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["size"], row["sliding"]) for row in rows] == [
         ("3 × 3", "True"), ("5 × 5", "True"), ("3 × 3", "False"), ("5 × 5", "False"),
     ]  # fmt: skip
     assert all(float(row["step [ms]"]) > 0.0 and float(row["iterations"]) > 0.0 for row in rows)
+    assert {row["fabric"] for row in rows} == {"cotton"}
     assert float(rows[0]["relative to 3 × 3"]) == 1.0
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert "slope of time over crossings" in capsys.readouterr().out
@@ -247,7 +363,7 @@ def test_a_size_that_fails_is_a_row_with_a_reason(monkeypatch):
         return {"failure": "step 1: torn"} if size == 7 else fine
 
     monkeypatch.setattr(sizes, "apart", apart)
-    rows = sizes.benchmark((7, 5), True, "linear", 1)
+    rows = sizes.benchmark((7, 5), True, "linear", "paper", 1)
     assert [row["failure"] for row in rows] == ["step 1: torn", ""]
     assert set(rows[0]) == set(rows[1])
     assert rows[1]["arrays per crossing [kB]"] == pytest.approx(1.0 / 25)
@@ -293,6 +409,7 @@ def test_a_solve_makes_the_iterations_that_it_is_asked_for():
         solver.solve(1000)
 
 
+@pytest.mark.slow
 def test_chart_3_from_the_command(monkeypatch, tmp_path):
     monkeypatch.setattr(bandwidth, "ELEMENTS", 3000)
     output, plot = tmp_path / "b.csv", tmp_path / "b.png"
@@ -362,7 +479,7 @@ def test_half_the_step_keeps_paths_in_time():
     path = cloth.position[pins] + np.linspace(0.0, 1e-3, 5)[1:, None, None]
     force = np.linspace(1e-4, 3e-4, 3)[:, None] * [[0.0, 1.0, 0.0]]
     scene = wy.Scene(cloth, pins=pins, pin_path=path, forces={cloth.node(3, 1): force})
-    half = ablation._halved(scene)
+    half = ablation._halved(scene, None)
     whole, fine = wy.Simulator(scene, step=1e-5), wy.Simulator(half, step=5e-6)
     # what holds a step of the whole holds two of the half: their mean forces are equal at every such step
     for _ in range(6):
@@ -414,12 +531,22 @@ def test_the_command_takes_a_scene_from_a_file(tmp_path, capsys):
     assert "gravity moves the cloth by 100 %" in told
 
 
+def test_the_command_takes_a_fabric_by_name(capsys):
+    found = terms_scene.main(["--fabric", "cotton", "--size", "4", "--steps", "2", "--repeats", "1"])
+    assert {"stretch", "wind", "sliding"} <= {change.name for change in found.changes}
+    scene, _ = terms_scene.chosen(terms_scene.parser().parse_args(["--fabric", "cotton", "--size", "4"]))
+    assert scene.cloth.yarns == wy.fabrics.cotton().yarns
+    assert "4 × 4 yarns, 2 steps" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["nowhere.py"], "nowhere.py: there is no such file"),
         (["empty.py"], "must set `scene`"),
         (["empty.py", "--size", "5"], "--size"),
+        (["empty.py", "--fabric", "paper"], "--fabric"),
+        (["--fabric", "felt"], "--fabric"),
         (["--steps", "0"], "--steps = 0"),
         (["--repeats", "0"], "--repeats = 0"),
         (["--step", "0"], "step = 0"),
@@ -434,8 +561,9 @@ def test_wrong_arguments_of_the_command(arguments, named, tmp_path, monkeypatch,
     assert named in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_chart_4_from_the_command(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(terms.MOTIONS, "hung", SHORT)
+    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
     output, plot = tmp_path / "t.csv", tmp_path / "t.png"
     terms.main(["--size", "3", "--motions", "hung", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
     with open(output, newline="") as file:
@@ -464,9 +592,60 @@ def test_the_default_region_of_the_map_is_not_broken():
 
 def test_an_explicit_method_ends_where_the_map_says():
     """The stiffest mode: a hundred times the modulus is a tenth of the step."""
-    limits = [stability.explicit_limit(stretch) for stretch in (1.0, 100.0)]
+    cases = [stability.Case(), stability.Case(stretch=100.0), stability.Case(density=0.01)]
+    limits = [stability.explicit_limit(case) for case in cases]
     assert 1e-6 < limits[1] < limits[0] < 1e-3
     assert limits[0] / limits[1] == pytest.approx(10.0, rel=0.1)
+    # ω² is of a stiffness over a mass
+    assert limits[0] / limits[2] == pytest.approx(10.0, rel=1e-9)
+
+
+def test_how_stiff_a_case_is():
+    step = 1e-3
+    cotton = stability.Case(fabric="cotton")
+    # k_s 20 N, ρ 2e-5 kg/m, L 1/2300 m
+    assert cotton.stiffness(step) == pytest.approx(20.0 * step**2 / (2e-5 / 2300.0**2))
+    assert stability.Case(fabric="cotton", density=0.1, stretch=3.0).stiffness(step) == pytest.approx(
+        30.0 * cotton.stiffness(step)
+    )
+    # every fabric at 1 ms, and no run beyond
+    for name in wy.fabrics.FABRICS:
+        case = stability.Case(fabric=name)
+        assert 66 in case.counts()
+        assert all(case.stiffness(stability.DURATION / count) <= stability.STIFFEST for count in case.counts())
+    assert stability.Case().counts() == stability.COUNTS
+    assert len(cotton.counts()) < len(stability.COUNTS)
+
+
+def test_a_light_cloth_is_blown_farther():
+    heavy, light = stability.Case().farthest(), stability.Case(density=0.01).farthest()
+    fall = 0.5 * 9.8 * stability.DURATION**2
+    assert fall < heavy < light
+    # the wind's share of it
+    assert (light - fall) / (heavy - fall) == pytest.approx(100.0)
+
+
+def test_the_map_from_the_command(tmp_path, monkeypatch):
+    monkeypatch.setattr(stability, "one_core", lambda: None)
+    monkeypatch.setattr(stability, "COUNTS", (66, 20, 6, 2))
+    monkeypatch.setattr(stability, "FINEST", 66)
+    monkeypatch.setattr(stability, "STRETCH", (1.0, 10.0))
+    monkeypatch.setattr(
+        stability, "OTHERS", (stability.Case(), stability.Case(size=3), stability.Case(fabric="cotton"))
+    )
+    monkeypatch.setattr(stability, "INTEGRATORS", {"linear": stability.INTEGRATORS["linear"]})
+    output, png = tmp_path / "s.csv", tmp_path / "s.png"
+    chosen = ["--fabric", "handkerchief", "--densities", "1", "0.5"]
+    stability.main(["--quick", *chosen, "--output", str(output), "--png", str(png)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    # one step of 1/90 s is left, and cotton has 6e8 there
+    assert {(row["fabric"], row["size"], row["density"], row["stretch"]) for row in rows} == {
+        ("handkerchief", "5", "1.0", "1.0"), ("handkerchief", "5", "0.5", "1.0"),
+        ("handkerchief", "3", "1.0", "1.0"),
+    }  # fmt: skip
+    assert all(1e5 < float(row["k_s h²/(m L)"]) < stability.STIFFEST for row in rows)
+    assert png.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_broken_run_says_what_broke_it(monkeypatch):
@@ -480,6 +659,7 @@ def test_a_broken_run_says_what_broke_it(monkeypatch):
     assert (row["verdict"], row["cause"]) == ("broken", "Newton")
 
 
+@pytest.mark.slow
 def test_the_map_is_drawn(tmp_path):
     maps, others = (stability.Case(),), (stability.Case(size=3),)
     rows = stability.benchmark(maps, others, (6, 2))

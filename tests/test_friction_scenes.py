@@ -92,6 +92,7 @@ def test_steady_pull(share: float, slides: bool) -> None:
         assert 0.0 <= slid[-1] < 5e-6
 
 
+@pytest.mark.slow
 def test_command_writes_a_chart_and_numbers(tmp_path) -> None:
     png, csv = tmp_path / "a.png", tmp_path / "a.csv"
     options = ["--size", "5", "--distance", "5e-6", "--png", str(png), "--csv", str(csv)]

@@ -95,8 +95,12 @@ def gradcheck(function: Callable, inputs: list[torch.Tensor]) -> bool:
     return torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("steps", [1, 5])
-@pytest.mark.parametrize("group", GROUPS)
+FEW = ("materials", "initial state")
+MARKED_GROUPS = [group if group in FEW else pytest.param(group, marks=pytest.mark.slow) for group in GROUPS]
+
+
+@pytest.mark.parametrize("steps", [1, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("group", MARKED_GROUPS)
 def test_gradcheck(group: str, steps: int) -> None:
     rollout = wt.Rollout(scene_for(group, steps), steps, frames=[steps], integrator="linear", tolerance=EXACT)
     fixed = jittered(rollout.scene.cloth)
@@ -105,7 +109,7 @@ def test_gradcheck(group: str, steps: int) -> None:
     assert gradcheck(*scaled(rollout, GROUPS[group], fixed))
 
 
-@pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize("steps", [1, pytest.param(5, marks=pytest.mark.slow)])
 def test_gradcheck_exact_pins(steps: int) -> None:
     rollout = wt.Rollout(
         scene_for("exact pins", steps, stiffness=None), steps, frames=[steps], integrator="linear", tolerance=EXACT
@@ -114,6 +118,7 @@ def test_gradcheck_exact_pins(steps: int) -> None:
     assert gradcheck(function, inputs)
 
 
+@pytest.mark.slow
 def test_gradcheck_locked() -> None:
     rollout = wt.Rollout(scene_for("locked", 3, sliding=False), 3, frames=[3], integrator="linear", tolerance=EXACT)
     fixed = jittered(rollout.scene.cloth, sliding=False)
@@ -153,6 +158,7 @@ def hung(friction: float, friction_damping: float, steps: int = 50) -> tuple[wt.
 OF_SLIDING = ("friction", "friction_stiffness", "friction_damping", "friction_sharpness", "parallel_stiffness")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slippery", [False, True], ids=["the paper's cloth", "a slippery cloth"])
 def test_every_parameter_of_the_hung_cloth(slippery: bool) -> None:
     # On the paper's cloth sliding moves positions by less than differences can resolve, so what rules sliding is
@@ -199,6 +205,7 @@ def test_gradient_error_follows_the_solver_tolerance() -> None:
         assert error < 300.0 * tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_limit", [False, True], ids=["relaxed", "friction at its limit"])
 def test_state_of_rest_has_finite_and_right_gradients(at_limit: bool) -> None:
     fabric = cloth(5, 5, pose="flat", friction_damping=0.1)
@@ -288,6 +295,7 @@ def test_two_runs_in_one_loss() -> None:
     assert torch.equal(torch.stack(torch.autograd.grad(both, values)), torch.stack(separate))
 
 
+@pytest.mark.slow
 def test_torch_is_imported_when_asked_for(tmp_path) -> None:
     code = "import sys, warp_yarn as wy; assert 'torch' not in sys.modules; wy.torch.Rollout"
     # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one

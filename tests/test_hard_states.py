@@ -274,6 +274,7 @@ def rests(cloth: wy.Cloth, euler: np.ndarray) -> np.ndarray:
     return euler[:, b, direction] - euler[:, a, direction]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATES)
 def test_ten_times_in_a_row(name: str) -> None:
     """Every step passes its tolerance (or there is an error), crossings keep their order, energy does not grow."""
@@ -309,6 +310,7 @@ def check_energy(energies: list[dict[str, float]], overshoot: float, rounding: f
     assert (total - np.minimum.accumulate(total)).max() <= overshoot * own + rounding * size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["straight", "strip", "no_pins", "storm", "heavy"])
 def test_gradient_of_smooth_motion(name: str) -> None:
     """By the initial positions and velocities and by the materials, against extrapolated differences."""

@@ -154,6 +154,7 @@ def test_ros2_is_the_textbook_s(sliding: bool) -> None:
 CASES = {**GROUPS, "exact pins": ("pin_path", "stretch", "position")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", BEYOND_EQ_2)
 @pytest.mark.parametrize("group", CASES)
 def test_directional_derivatives(method: str, group: str) -> None:
@@ -341,6 +342,7 @@ def test_a_stage_that_does_not_converge_stops_the_run() -> None:
     assert np.array_equal(simulator.state.euler_velocity, state.euler_velocity)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", INTEGRATORS)
 def test_two_cores_do_what_one_does(method: str) -> None:
     scene = wy.paper.hung_cloth("twill", 7, 19, (1, 2))

@@ -224,6 +224,7 @@ def test_a_minimum_inside_the_ranges_has_no_gradient(data):
     assert np.abs(result.gradient).max() < 1e-3 * np.abs(first).max()
 
 
+@pytest.mark.slow
 def test_noise_scatters_values_as_the_uncertainties_say(data):
     rng = np.random.default_rng(1)
     problem = task(data)
@@ -275,6 +276,7 @@ def test_a_start_that_cannot_be_simulated_raises(data):
         learn(problem)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("after", "times"), [(1, 1), (3, 1), (5, 4)])
 def test_a_resumed_run_ends_where_an_uninterrupted_one_ends(tmp_path, after, times):
     rng = np.random.default_rng(0)
@@ -409,6 +411,7 @@ def test_the_step_is_halved_to_that_of_the_data_and_no_further():
     assert once.task.step == pytest.approx(5e-4)
 
 
+@pytest.mark.slow
 def test_noise_halves_no_step(data):
     """Eq. 2's step has an error of many percent of these values, and the data have it: a shorter step would not do."""
     rng = np.random.default_rng(1)
@@ -470,6 +473,7 @@ def test_the_command_learns_writes_and_tells(recording, tmp_path, capsys):
     assert "simulations" in told and "shorter step" not in told
 
 
+@pytest.mark.slow
 def test_the_animation_has_data_and_model_next_to_each_other(recording, tmp_path):
     usd = tmp_path / "learn.usda"
     arguments = [str(recording), *SMALL, "--first", "2", "--every", "2", "--frames", "2", "--output", str(usd)]
@@ -522,6 +526,7 @@ def test_other_parameters_and_ranges(recording, tmp_path):
     assert of["wind_drag"]["in the file"] == 0.5
 
 
+@pytest.mark.slow
 def test_an_interrupted_command_is_resumed(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(scene_script, "plot", lambda *of: None)  # tested elsewhere, and slow
     usd = tmp_path / "learn.usdc"
@@ -565,6 +570,7 @@ def published_file(path, trajectory):
                 file[f"Steps/{group}/Node {i} {j}/{kind}"] = rows
 
 
+@pytest.mark.slow
 def test_a_published_file_is_learned_from_its_frame_1(tmp_path):
     path = tmp_path / "published.h5"
     scene = wy.paper.hung_cloth(rows=4, columns=5, published_scaling=True)
@@ -693,6 +699,7 @@ def test_wind_does_not_go_with_a_published_file(recording, tmp_path, capsys):
 # -- benchmarks/optimizers.py -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_method_has_a_row_of_what_it_took(monkeypatch, tmp_path):
     monkeypatch.setattr(optimizers, "RATES", {"Adam": (0.1,), "gradient descent": (0.1,)})
     monkeypatch.setattr(optimizers, "PAPER", (DENSITY, SHEAR))

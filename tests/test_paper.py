@@ -122,6 +122,7 @@ def test_table2_learns_the_yarns(tmp_path, capsys):
     assert "paper_table2.csv" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_table3_has_a_case_for_each_number_of_frames(tmp_path):
     arguments = ["table3", "--size", "4", "--frames", "3", "5", "--truth", "finer", "--weaves", "twill"]
     rows = paper.main([*arguments, "--yarns", "2 3", "--results", str(tmp_path)])
@@ -131,6 +132,7 @@ def test_table3_has_a_case_for_each_number_of_frames(tmp_path):
     assert len(read(tmp_path / "paper_table3.csv")) == 16
 
 
+@pytest.mark.slow
 @needs_bayesian
 def test_table4_compares_predictions(tmp_path, capsys):
     arguments = ["table4", "--size", "4", "--weaves", "plain", "--yarns", "1 3", "--frames", "5", "--test", "8"]
@@ -149,6 +151,7 @@ def test_table4_compares_predictions(tmp_path, capsys):
     assert float(read(tmp_path / "paper_table4.csv")[0]["ours"]) == row["ours"]
 
 
+@pytest.mark.slow
 @needs_bayesian
 def test_figure6_shows_growth(tmp_path):
     plot = tmp_path / "folder" / "figure6.png"
@@ -161,6 +164,7 @@ def test_figure6_shows_growth(tmp_path):
     assert plot.stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_bias_has_every_integrator(tmp_path):
     plot = tmp_path / "bias.png"
     arguments = ["bias", "--size", "4", "--frames", "4", "--steps", "1e-3", "5e-4", "--plot", str(plot)]
@@ -189,6 +193,7 @@ def test_a_prediction_that_fails_is_infinitely_wrong():
 # -- baselines --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_bayesian
 def test_bayesian_optimization_finds_a_valley_and_survives_failures():
     low, high = np.array([1e-3, 0.0]), np.array([3e-3, 1e5])

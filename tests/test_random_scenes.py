@@ -1,6 +1,7 @@
 """Random scenes: whatever they are, a run ends in success or in one of the project's own errors."""
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -65,6 +66,7 @@ def scenes(draw: st.DrawFn) -> tuple[wy.Scene, float]:
     return scene, draw(log_uniform(1e-4, 1.0 / 30.0))
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow])
 @given(scenes())
 def test_success_or_an_error_of_ours(case: tuple[wy.Scene, float]) -> None:

@@ -14,6 +14,8 @@ from waving import BLUE, RED, waving
 import warp_yarn as wy
 from warp_yarn import geometry, render
 
+pytestmark = pytest.mark.slow  # VTK takes seconds to load and to draw
+
 SIZE = (160, 120)
 
 

@@ -44,6 +44,17 @@ def test_wind_weave_yarns_and_size_are_the_ones_asked_for(usd):
     assert UsdGeom.Mesh(Usd.Stage.Open(str(usd)).GetPrimAtPath("/cloth/yarn_0"))
 
 
+@pytest.mark.parametrize("fabric", wy.fabrics.FABRICS)
+def test_the_fabric_is_the_one_asked_for(fabric, usd, tmp_path):
+    record = str(tmp_path / "first.npz")
+    arguments = ["--fabric", fabric, "--size", "4", "--weave", "satin", "--steps", "2", "--output", str(usd)]
+    cloth = hang.main([*arguments, "--record", record]).cloth
+    expected = wy.fabrics.FABRICS[fabric](rows=4, columns=4, weave="satin")
+    assert cloth.weave.name == "satin"
+    assert (cloth.yarns, cloth.spacing, cloth.radius) == (expected.yarns, expected.spacing, expected.radius)
+    assert hang.main(["--resume", record, "--steps", "1", "--output", str(usd)]).cloth.yarns == expected.yarns
+
+
 def test_locked_yarns_do_not_slide(usd):
     trajectory = hang.main(["--size", "5", "--steps", "5", "--output", str(usd), "--locked"])
     np.testing.assert_array_equal(trajectory.euler, np.broadcast_to(trajectory.cloth.euler, trajectory.euler.shape))
@@ -65,7 +76,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(usd, tmp_path):
 def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
     record = str(tmp_path / "first.npz")
     hang.main(["--size", "5", "--steps", "1", "--output", str(usd), "--record", record])
-    for option in (["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"]):
+    for option in (["--fabric", "paper"], ["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"]):
         assert exit_code(hang, ["--resume", record, *option]) == 2
         assert option[0] in capsys.readouterr().err
 
@@ -116,6 +127,9 @@ def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
         (["--columns", "-4"], "columns = -4"),
         (["--size", "five"], "--size"),
         (["--weave", "knit"], "--weave"),
+        (["--fabric", "felt"], "--fabric"),
+        (["--fabric", "cotton", "--size", "2"], "rows = 2"),
+        (["--fabric", "cotton", "--yarns", "1", "2"], "--yarns = 1 2"),
         (["--yarns", "1", "1"], "yarns = 1 1"),
         (["--yarns", "1", "9"], "yarns = 1 9"),
         (["--wind", "0", "nan", "0"], "wind velocity[1] is nan"),
@@ -145,6 +159,7 @@ def test_a_folder_that_cannot_be_made_ends_with_code_2(tmp_path, capsys):
     assert "file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pictures_on_request(usd, tmp_path):
     png, mp4 = tmp_path / "hang.png", tmp_path / "pictures" / "hang.mp4"
     arguments = ["--size", "3", "--steps", "4", "--slowdown", "20", "--png", str(png), "--mp4", str(mp4)]

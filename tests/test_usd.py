@@ -227,6 +227,7 @@ def thin(tmp_path):
     del stage, stage_of_tubes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [0, 2])
 def test_tubes_are_at_the_radius_from_their_curves_and_face_outward(thin, frame):
     for curve, mesh in thin:

@@ -1,9 +1,10 @@
 """Differentiable simulation of woven fabric, yarn by yarn."""
 
 import importlib
+import importlib.metadata
 from types import ModuleType
 
-from . import paper
+from . import fabrics, paper
 from .cloth import Cloth, Yarn
 from .errors import GradientError, InputError, SimulationError, WarpYarnError
 from .published import Published, read_published
@@ -13,6 +14,8 @@ from .simulator import Simulator
 from .state import State, Trajectory
 from .usd import write_usd
 from .weave import WEAVES, Weave
+
+__version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
     "WEAVES",
@@ -29,6 +32,8 @@ __all__ = [
     "Weave",
     "Wind",
     "Yarn",
+    "__version__",
+    "fabrics",
     "paper",
     "read_published",
     "write_mp4",

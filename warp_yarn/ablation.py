@@ -129,7 +129,7 @@ def ablate(
         return _Run(scene, fine * steps, step / fine, start, options)
 
     left_out = [name for name in scene.terms if name not in KEPT] + ["sliding"] * scene.sliding
-    full, half = run(scene), run(_halved(scene), 2)
+    full, half = run(scene), run(_halved(scene, start), 2)
     full.make()
     half.make()
     moved = full.distance(full.position[0])
@@ -214,11 +214,16 @@ def _without(scene: Scene, names: set[str]) -> Scene:
     return result
 
 
-def _halved(scene: Scene) -> Scene:
-    """The scene for half the step: what follows a path by the step stays where it is for two."""
+def _halved(scene: Scene, start: State | None) -> Scene:
+    """The scene for half the step: what follows a path by the step stays where it is for two, but for exact pins, which
+    go evenly from one place to the next."""
     result = copy.copy(scene)
     if scene.pin_path is not None:
         result.pin_path = np.repeat(scene.pin_path, 2, axis=0)
+        if scene.pin_stiffness is None:
+            first = (scene.cloth if start is None else start).position[scene.pins]
+            result.pin_path[::2] += np.concatenate([first[None], scene.pin_path[:-1]])
+            result.pin_path[::2] *= 0.5
     # its last row is what stays
     result.force_path = np.repeat(scene.force_path, 2, axis=0)[: 2 * len(scene.force_path) - 1]
     return result

@@ -70,8 +70,8 @@ class Cloth:
         weave: Weave,
         *,
         yarns: Sequence[Yarn],
-        warp: Sequence[int] | None = None,
-        weft: Sequence[int] | None = None,
+        warp: Sequence[int] | np.ndarray | None = None,
+        weft: Sequence[int] | np.ndarray | None = None,
         spacing: float = 1e-3,
         radius: float = 5e-4,
         shear: float = 1000.0,
@@ -144,7 +144,7 @@ class Cloth:
         bottom = [self.node(-1, 0), self.node(-1, -1)]
         return {"top": top, "bottom": bottom, "all": top + bottom}[which]
 
-    def _materials(self, name: str, value: Sequence[int] | None, count: int) -> np.ndarray:
+    def _materials(self, name: str, value: Sequence[int] | np.ndarray | None, count: int) -> np.ndarray:
         if value is None:
             return np.arange(count) % len(self.yarns)
         if len(value) != count:

@@ -105,7 +105,7 @@ def value_of(scene: Scene, name: str) -> float:
         raise InputError(f"parameter {name!r}: {base} is one number, it takes no index")
     if count is not None and (k is None or k >= count):
         raise InputError(f"parameter {name!r}, must have an index from 0 to {count - 1}, such as '{base}[0]'")
-    if base in OF_YARNS:
+    if base in OF_YARNS and k is not None:
         return float(getattr(scene.cloth.yarns[k], base))
     if base in OF_CLOTHS:
         return float(getattr(scene.cloth, base))
@@ -121,7 +121,7 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
     """
     for name in values:
         value_of(scene, name)
-    parts = {split(name): float(value) for name, value in values.items()}
+    parts: dict[tuple[str, int | None], Any] = {split(name): float(value) for name, value in values.items()}
     old, result = scene.cloth, copy.copy(scene)
     yarns = [
         dataclasses.replace(yarn, **{base: value for (base, j), value in parts.items() if base in OF_YARNS and j == k})
@@ -130,7 +130,7 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
     numbers = {name: parts.get((name, None), getattr(old, name)) for name in CLOTH_NUMBERS}
     result.cloth = Cloth(old.weave, yarns=yarns, warp=old.warp, weft=old.weft, pose=old.position, **numbers)
     if scene.wind is not None:
-        velocity = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
+        velocity: Any = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
         rest = {OF_WINDS[name]: parts[name, None] for name in ("wind_density", "wind_drag") if (name, None) in parts}
         result.wind = dataclasses.replace(scene.wind, velocity=velocity, **rest)
     if scene.gravity is not None:
@@ -204,7 +204,7 @@ class Task:
         """Settles the step, and with it the rollout."""
         self.steps_per_frame, self.step = steps_per_frame, self.frame_time / steps_per_frame
         after = np.arange(1, len(self.positions) + 1) * steps_per_frame
-        self.rollout = Rollout(self.scene, int(after[-1]), frames=after, step=self.step, **self.options)
+        self.rollout = Rollout(self.scene, int(after[-1]), frames=after.tolist(), step=self.step, **self.options)
         self.rollout.simulator.state = self.initial  # to have it checked
 
     def halved(self) -> Task:
@@ -528,7 +528,7 @@ class _Search:
         self.most_steps = task.steps_per_frame * 2**halvings
         self.y = (task.start - task.low) / (task.high - task.low)
         self.residuals = np.zeros(0)
-        self.jacobian: np.ndarray | None = None
+        self.jacobian: Any = None  # or an array
         self.fresh = False  # whether the Jacobian is of differences taken here
         self.damping = 1e-3
         self.scale = np.zeros(len(self.y))  # the largest norm of each column so far, as Marquardt scales
@@ -654,7 +654,7 @@ class _Search:
 
     # -- files -------------------------------------------------------------------------------------------------------
 
-    def _identity(self) -> dict[str, np.ndarray]:
+    def _identity(self) -> dict[str, Any]:
         """What a checkpoint must agree with."""
         return {
             "names": np.array(self.task.names),
@@ -665,9 +665,11 @@ class _Search:
         }
 
     def save(self, path: Path) -> None:
-        history = {field: np.array([getattr(i, field) for i in self.history]) for field in _OF_ITERATIONS}
+        history: dict[str, Any] = {
+            field: np.array([getattr(i, field) for i in self.history]) for field in _OF_ITERATIONS
+        }
         known = np.zeros((0, len(self.y))) if self.jacobian is None else self.jacobian
-        state = {
+        state: dict[str, Any] = {
             "y": self.y,
             "steps_per_frame": self.task.steps_per_frame,
             "damping": self.damping,

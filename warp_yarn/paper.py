@@ -31,20 +31,24 @@ WIND = (0.0, 5.0, 0.0)
 """Velocity of their wind [m/s]."""
 
 
-def cloth(weave: str = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2)) -> Cloth:
+def cloth(
+    weave: str = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
+) -> Cloth:
     """A cloth of two of the paper's yarns, upright.
 
     Args:
         weave: "plain", "twill" or "satin".
         rows, columns: number of warp and of weft yarns, at least 3.
         yarns: the numbers of two different yarns; even yarns of the cloth are of the first, odd ones of the second.
+        options: of the Cloth, to change it: ``pose``, ``friction``, ...
     """
     pair = tuple(sorted(yarns))
     if pair not in SHEAR:
         pairs = ", ".join(f"{a} {b}" for a, b in SHEAR)
         raise InputError(f"yarns = {' '.join(map(str, yarns))}, must be two that the paper combines: {pairs}")
     make = WEAVES[choice("weave", weave, WEAVES)]
-    return Cloth(make(rows=rows, columns=columns), yarns=[YARNS[k] for k in yarns], shear=SHEAR[pair])
+    draft = make(rows=rows, columns=columns)
+    return Cloth(draft, **{"yarns": [YARNS[k] for k in yarns], "shear": SHEAR[pair], **options})
 
 
 def hung(cloth: Cloth, **options: Any) -> Scene:

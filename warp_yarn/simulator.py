@@ -77,7 +77,7 @@ class Simulator:
         chunk: int | None = None,
         differentiable: bool = False,
     ):
-        method = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
+        method: Any = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
         self.model = Model(
             scene,
             step=step,
@@ -123,7 +123,7 @@ class Simulator:
     def state(self) -> State:
         """The present state, as a copy; setting it checks shapes, finiteness and that crossings are in order."""
         nodes = self.scene.cloth.nodes
-        values = {}
+        values: dict[str, Any] = {}
         for name, width in STATE_TYPES.items():
             array = self.arrays[name]
             values[name] = None if array is None else array.numpy().reshape(nodes, width).astype(np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,11 +75,14 @@ class Trajectory:
 
     def cut(self, frames: int) -> Trajectory:
         """The first frames of it."""
-        return dataclasses.replace(self, **{name: getattr(self, name)[:frames] for name in FIELDS})
+        parts: dict[str, Any] = {name: getattr(self, name)[:frames] for name in FIELDS}
+        return dataclasses.replace(self, **parts)
 
     def joined(self, later: Trajectory) -> Trajectory:
         """This and a run that went on from its last frame."""
-        parts = {name: np.concatenate([getattr(self, name), getattr(later, name)[1:]]) for name in FIELDS}
+        parts: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(later, name)[1:]]) for name in FIELDS
+        }
         return dataclasses.replace(self, **parts)
 
     def save(self, path: str | os.PathLike) -> None:

@@ -51,9 +51,9 @@ def gather(model: Model) -> System:
     other = neighbour[node, slot]
     add(x[node], x[other], values["upper_xx"].reshape(nodes, stencil, 3, 3)[node, slot])
     if model.scene.sliding:
-        for d in range(2):
-            add(x, s[:, [d]], values["diagonal_xs"].reshape(nodes, 2, 3)[:, d, :, None])
-            add(s[:, [d]], s[:, [d]], values["diagonal_ss"].reshape(nodes, 2)[:, d, None, None], mirror=False)
+        for k in range(2):
+            add(x, s[:, [k]], values["diagonal_xs"].reshape(nodes, 2, 3)[:, k, :, None])
+            add(s[:, [k]], s[:, [k]], values["diagonal_ss"].reshape(nodes, 2)[:, k, None, None], mirror=False)
         near = slot < 4
         node, slot, other = node[near], slot[near], other[near]
         d = slot % 2

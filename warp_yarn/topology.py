@@ -66,7 +66,7 @@ def rectangle(weave: Weave) -> Topology:
     segment_nodes, segment_yarn = along((index[:, :-1], index[:, 1:]), (index[:-1], index[1:]))
     bend_nodes, bend_yarn = along((index[:, :-2], index[:, 1:-1], index[:, 2:]), (index[:-2], index[1:-1], index[2:]))
 
-    neighbour = np.full((rows, columns, 6), -1, dtype=np.int32)
+    neighbour: np.ndarray = np.full((rows, columns, 6), -1, dtype=np.int32)
     neighbour[:, :-1, 0] = index[:, 1:]
     neighbour[:-1, :, 1] = index[1:]
     neighbour[:, :-2, 2] = index[:, 2:]

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom, Vt
 
 from .errors import InputError, number, whole
 from .files import whole_file
 from .geometry import Strands, Tubes, strands
 from .state import Trajectory
+
+if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
+    from pxr import UsdGeom
 
 ENDINGS = (".usd", ".usda", ".usdc")
 TUBE_SAMPLES = 4
@@ -44,6 +47,8 @@ def write_usd(
     Raises:
         InputError: an argument is out of its range, or the folder of `path` does not exist.
     """
+    from pxr import Usd, UsdGeom
+
     slowdown = number("slowdown", slowdown, above=0.0)
     sides = whole("sides", sides, least=3)
     if Path(path).suffix not in ENDINGS:
@@ -72,6 +77,8 @@ def write_usd(
 
 
 def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float) -> None:
+    from pxr import UsdGeom, Vt
+
     curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
     curves.CreateBasisAttr(UsdGeom.Tokens.catmullRom)
     # Repeated end points instead of `pinned`, whose segments Storm miscounts.
@@ -86,6 +93,8 @@ def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float) -> 
 
 
 def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands) -> None:
+    from pxr import Vt
+
     corners, vertices = shape.faces()
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(corners.astype(np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(vertices.astype(np.int32)))
@@ -96,12 +105,16 @@ def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands) -> None:
 
 def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
     """displayColor is linear; the colours of yarns are those of a screen (sRGB)."""
+    from pxr import Gf, UsdGeom
+
     color = np.array(part.color, dtype=np.float64)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*linear.tolist())])
 
 
 def _write_points(shape: UsdGeom.PointBased, frame: int, points: np.ndarray, margin: float) -> None:
+    from pxr import Vt
+
     points = points.astype(np.float32)
     shape.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), frame)
     extent = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])

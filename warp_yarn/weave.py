@@ -69,7 +69,7 @@ class Weave:
         return f"Weave({self.name}, {self.rows} × {self.columns})"
 
 
-def _grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+def _grid(rows: int, columns: int) -> np.ndarray:
     return np.indices((whole("rows", rows, least=3), whole("columns", columns, least=3)))
 
 

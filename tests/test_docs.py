@@ -1,0 +1,88 @@
+"""That pages for users say what the code has: every term has its section, every name in the glossary its object."""
+
+import dataclasses
+import importlib
+import inspect
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from warp_yarn.kernels import TERMS
+
+import warp_yarn as wy
+from warp_yarn.topology import Topology
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+
+
+def anchors(text: str) -> set[str]:
+    """As GitHub makes them of headings."""
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def rows() -> list[list[str]]:
+    """Of the glossary's tables of symbols."""
+    lines = (ROOT / "docs" / "glossary.md").read_text().split("## Words")[0].splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    return [row for row in cells if not set("".join(row)) <= set("- ") and row[0] != "symbol"]
+
+
+def test_every_term_has_its_section():
+    headings = re.findall(r"^## (.+)$", (ROOT / "docs" / "physics.md").read_text(), flags=re.M)
+    named = {name.strip() for heading in headings for name in heading.split(",")}
+    assert set(TERMS) <= named
+    # and no term that is none: other sections begin with a capital
+    assert {name for name in named if name[0].islower()} == set(TERMS)
+
+
+@pytest.mark.parametrize("row", rows(), ids=lambda row: f"{row[0] or row[1]}")
+def test_a_name_of_the_glossary_is_in_the_code(row):
+    assert len(row) == 5
+    (name,) = re.findall(r"^`([\w.]+)`$", row[-1])
+    base, _, member = name.rpartition(".")
+    if base.startswith(("kernels", "integrators")):
+        assert hasattr(importlib.import_module(f"warp_yarn.{base}"), member)
+    else:
+        cls = Topology if base == "Topology" else getattr(wy, base)
+        parameters = inspect.signature(cls).parameters
+        assert member in parameters or hasattr(cls, member) or f"self.{member} =" in inspect.getsource(cls)
+
+
+def test_every_number_of_a_cloth_is_in_the_glossary():
+    listed = {row[-1].strip("`") for row in rows()}
+    numbers = {"Yarn": {"density", "stretch", "bend"}, "Wind": {f.name for f in dataclasses.fields(wy.Wind)}}
+    floats = inspect.signature(wy.Cloth).parameters.values()
+    numbers["Cloth"] = {p.name for p in floats if p.annotation == "float"}
+    assert len(numbers["Cloth"]) == 8
+    missing = {f"{cls}.{name}" for cls, names in numbers.items() for name in names} - listed
+    assert not missing
+
+
+@pytest.mark.parametrize("page", [*DOCS, *sorted(ROOT.glob("*.md"))], ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if target.startswith(("http://", "https://")):
+            continue
+        file, _, anchor = target.partition("#")
+        path = page.parent / file if file else page
+        assert path.exists(), target
+        if anchor:
+            assert anchor in anchors(path.read_text()), target
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    section = (ROOT / "README.md").read_text().split("## Test it")[1]
+    command = re.search(r"```bash\n(.+)\n```", section)[1]
+    assert ".venv/bin/mypy" in command and command.endswith(".venv/bin/pytest")
+    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
+
+
+def test_the_package_says_its_version_and_that_it_has_types():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert wy.__version__ == project["project"]["version"]
+    assert project["tool"]["setuptools"]["package-data"]["warp_yarn"] == ["py.typed"]
+    assert (ROOT / "warp_yarn" / "py.typed").exists()
+    assert f"## {wy.__version__}" in (ROOT / "CHANGELOG.md").read_text()

@@ -1,0 +1,127 @@
+"""What never imports what: device code knows nothing of the rest, and importing warp_yarn loads no more than it needs.
+
+The rules are of the tree as it is. A rule that names a module that is gone fails, so that a move takes its rule along.
+"""
+
+import ast
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from warp_yarn.kernels import TERMS
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = {"warp_yarn": "warp_yarn", "kernels": "warp_yarn.kernels"}
+"""Folders of the package and their names in it."""
+
+TERM_MODULES = {term.define.__module__ for term in TERMS.values()}
+K, W = "warp_yarn.kernels", "warp_yarn"
+SOLVER = {f"{K}.{name}" for name in ("access", "conjugate_gradient", "incomplete", "indexing", "solver", "team")}
+STEPPING = {f"{K}.{name}" for name in ("adjoint", "history", "ros2", "stage", "stage_adjoint", "step")}
+DESCRIPTION = {f"{W}.{name}" for name in ("cloth", "errors", "files", "state", "topology", "weave")}
+FILES_AND_PICTURES = {f"{W}.{name}" for name in ("files", "geometry", "published", "render", "state", "usd")}
+
+FORBIDDEN = {
+    "a solver imports no term": (SOLVER, TERM_MODULES),
+    "time stepping imports no term": (STEPPING, TERM_MODULES),
+    "what describes a cloth is NumPy alone": (DESCRIPTION, {"warp", K}),
+    "files and pictures import no simulator": (FILES_AND_PICTURES, {f"{W}.simulator", f"{W}.model"}),
+}
+
+ONLY = {"torch": {f"{W}.torch", f"{W}.learn"}, "pxr": {f"{W}.usd"}, "h5py": {f"{W}.published"}, "pyvista": set(),
+        "scenes": set(), "benchmarks": set(), "tests": set(), "common": set()}  # fmt: skip
+"""Where a package may be imported at all; render.py asks for PyVista by name."""
+
+BETWEEN_TERMS = {(f"{K}.parallel", f"{K}.stretch")}
+"""The barrier between crossings takes k_s of the yarn from there."""
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the package by its name."""
+    found = {}
+    for folder, package in FOLDERS.items():
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            parts = file.relative_to(ROOT / folder).with_suffix("").parts
+            found[".".join([package, *(part for part in parts if part != "__init__")])] = file
+    return found
+
+
+MODULES = modules()
+
+
+def imported(source: str, name: str, is_package: bool) -> set[str]:
+    """Names that a module's source imports, wherever it does: modules and, of ``from a import b``, a and a.b."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parts = name.split(".")
+            kept = parts[: len(parts) - node.level + is_package] if node.level else []
+            base = ".".join([*kept, *([node.module] if node.module else [])])
+            found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    return found
+
+
+@functools.cache
+def of(name: str) -> set[str]:
+    file = MODULES[name]
+    return imported(file.read_text(), name, file.name == "__init__.py")
+
+
+def reaches(names: set[str], forbidden: set[str]) -> set[str]:
+    """Which of the names are one of the forbidden modules, or within one."""
+    return {name for name in names if any(name == f or name.startswith(f"{f}.") for f in forbidden)}
+
+
+def test_imports_are_read_as_python_does():
+    source = "import a.b\nfrom . import c\nfrom .d import e\ndef f():\n    from ..g import h\n    import i"
+    expected = {"a.b", "p.q", "p.q.c", "p.q.d", "p.q.d.e", "p.g", "p.g.h", "i"}
+    assert imported(source, "p.q.m", False) == expected
+    assert imported(source, "p.q", True) == expected
+    assert reaches({"warp", "warp_yarn.cloth", "warp.types"}, {"warp"}) == {"warp", "warp.types"}
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name == K or name.startswith(f"{K}.")])
+def test_kernels_import_warp_and_themselves(name):
+    known = reaches(of(name), {"warp", K}) | reaches(of(name), set(sys.stdlib_module_names))
+    assert of(name) == known
+
+
+@pytest.mark.parametrize("rule", FORBIDDEN)
+def test_what_is_forbidden(rule):
+    importers, forbidden = FORBIDDEN[rule]
+    assert importers <= set(MODULES)
+    found = {name: reaches(of(name), forbidden) for name in importers}
+    assert not {name: names for name, names in found.items() if names}
+
+
+def test_integrators_name_no_term():
+    integrators = [name for name in MODULES if name.startswith(f"{W}.integrators")]
+    assert len(integrators) > 5
+    assert not {name for name in integrators if reaches(of(name), TERM_MODULES)}
+
+
+def test_terms_import_each_other_where_it_is_declared():
+    pairs = {(name, term) for name in TERM_MODULES for term in reaches(of(name), {term for term in TERM_MODULES})}
+    assert {(a, ".".join(b.split(".")[:3])) for a, b in pairs} == BETWEEN_TERMS
+
+
+@pytest.mark.parametrize("package", ONLY)
+def test_packages_are_imported_in_their_place(package):
+    assert {name for name in MODULES if reaches(of(name), {package})} == ONLY[package]
+
+
+def test_importing_the_package_loads_no_extra():
+    """In a process of its own: making a scene, too, needs Warp, NumPy and tqdm alone."""
+    program = (
+        "import sys, warp_yarn as wy; wy.paper.hung_cloth(rows=3, columns=3); wy.fabrics.cotton(); wy.write_usd;"
+        "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert {"warp", "warp_yarn", "numpy"} <= loaded
+    extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
+    assert not loaded & extras
