@@ -70,6 +70,18 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     for part in (step, ros2):
         kernels |= vars(part.define_reversible(variant))
-    for part in (step, solver, incomplete, conjugate_gradient, multilevel, ledger, history, adjoint, stage, stage_adjoint, ros2):
+    for part in (
+        step,
+        solver,
+        incomplete,
+        conjugate_gradient,
+        multilevel,
+        ledger,
+        history,
+        adjoint,
+        stage,
+        stage_adjoint,
+        ros2,
+    ):
         kernels |= vars(part.define(variant.forward))
     return kernels

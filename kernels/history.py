@@ -174,4 +174,13 @@ def define(variant: Variant) -> SimpleNamespace:
             if wp.static(sliding):
                 euler_velocity_grad[s] = euler_velocity_grad[s] + frame_euler_velocity_grad[2 * k + d]
 
-    return SimpleNamespace(count=count, take=take, give=give, move_along=move_along, give_back_along=give_back_along, record=record, recall=recall, receive=receive)
+    return SimpleNamespace(
+        count=count,
+        take=take,
+        give=give,
+        move_along=move_along,
+        give_back_along=give_back_along,
+        record=record,
+        recall=recall,
+        receive=receive,
+    )

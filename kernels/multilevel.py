@@ -354,7 +354,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 )  # fmt: skip
             first = direction * levels.coarse_warp_lines
             size = wp.where(
-                direction == 0, levels.coarse_warp_lines, levels.coarse_line_start.shape[0] - 1 - levels.coarse_warp_lines
+                direction == 0,
+                levels.coarse_warp_lines,
+                levels.coarse_line_start.shape[0] - 1 - levels.coarse_warp_lines,
             )
             for k in range(first + share(size, strip, strips), first + share(size, strip + 1, strips)):
                 solve_coarse(

@@ -209,9 +209,7 @@ def define(variant: Variant) -> SimpleNamespace:
         if status[0] == 0:
             residual[0] = norm / wp.max(change[0], scalar(1.0e-30))
         finishes[0] = 0
-        if norm == scalar(0.0):
-            finishes[0] = 1
-        elif step_length[0] == scalar(1.0) and left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]:
+        if norm == scalar(0.0) or (step_length[0] == scalar(1.0) and left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]):
             finishes[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)

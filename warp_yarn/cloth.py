@@ -59,7 +59,8 @@ class Cloth:
         shear: S, shear modulus of a crossing [Pa], at least 0.
         friction: μ, friction coefficient of a crossing, at least 0.
         friction_stiffness: k_f, spring of a stuck crossing [N/m], above 0.
-        friction_damping: d_f, damping of sliding [N s/m], at least 0.
+        friction_damping: d_f, damping of sliding [N s/m], at least 0; None: critical for the spring of a stuck
+            crossing, 2 √(k_f m), m the mean mass of a yarn's part at a crossing.
         friction_sharpness: p of eq. 4, how sharply a crossing breaks away, above 0.
         parallel_stiffness: k_c, repulsion of parallel yarns [N/m], at least 0.
         pose: "upright", (i L, 0, (rows − 1 − j) L); "flat", (i L, j L, 0); or positions, nodes × 3 [m].
@@ -77,7 +78,7 @@ class Cloth:
         shear: float = 1000.0,
         friction: float = 0.5,
         friction_stiffness: float = 1000.0,
-        friction_damping: float = 1000.0,
+        friction_damping: float | None = None,
         friction_sharpness: float = 10.0,
         parallel_stiffness: float = 1.0,
         pose: Any = "upright",
@@ -100,6 +101,9 @@ class Cloth:
         self.shear = number("shear", shear, least=0.0)
         self.friction = number("friction", friction, least=0.0)
         self.friction_stiffness = number("friction_stiffness", friction_stiffness, above=0.0)
+        if friction_damping is None:
+            mass = np.mean([self.yarns[k].density for k in self.material]) * self.spacing
+            friction_damping = 2.0 * float(np.sqrt(self.friction_stiffness * mass))
         self.friction_damping = number("friction_damping", friction_damping, least=0.0)
         self.friction_sharpness = number("friction_sharpness", friction_sharpness, above=0.0)
         self.parallel_stiffness = number("parallel_stiffness", parallel_stiffness, least=0.0)

@@ -46,6 +46,9 @@ PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
 NEWTON_TOLERANCE = 1e-3
+STIFF = 2e4
+"""k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch wave
+runs over a hundred crossings in a step."""
 RESOLVED = 4.0
 """Of steps that do not resolve the yarns' vibrations: a stretch wave runs from a crossing to the next in less than the
 ``RESOLVED``-th part of a step. A tenth at most is then added to the error of the second-order methods. The error of
@@ -91,7 +94,7 @@ class Model:
         step: float,
         device: Any,
         precision: str,
-        preconditioner: str,
+        preconditioner: str | None,
         tolerance: float | None,
         newton_tolerance: float | None,
         max_iterations: int | None,
@@ -103,6 +106,9 @@ class Model:
         self.scene = scene
         self.step_size = number("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
+        if preconditioner is None:
+            stiff = (self._stretch_rate().max(initial=0.0) * self.step_size) ** 2 > STIFF
+            preconditioner = "multilevel" if stiff else "incomplete"
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
         exact = differentiable and precision == "double"
         default = EXACT if exact else TOLERANCES[precision]
@@ -140,11 +146,15 @@ class Model:
 
     def _resolving_rate(self) -> float:
         """Of steps that begin to resolve the yarns' stretching [1/s]."""
-        cloth = self.scene.cloth
-        speed = np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns])
-        if self.precision == "single" or not speed.any():
+        rate = self._stretch_rate()
+        if self.precision == "single" or not rate.any():
             return math.inf
-        return speed[speed > 0.0].min() / (RESOLVED * cloth.spacing)
+        return rate[rate > 0.0].min() / RESOLVED
+
+    def _stretch_rate(self) -> np.ndarray:
+        """√(k_s/(m L)) of every material, m the mass of a segment [1/s]."""
+        cloth = self.scene.cloth
+        return np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns]) / cloth.spacing
 
     def _form_team(self, threads: int) -> None:
         """Strips of the cloth for so many processor cores (``kernels/team.py``)."""
@@ -365,7 +375,7 @@ class Model:
         self.watches = not (self.held and self.scene.pin_path is not None)
         for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 1), ("bounds", 5)):
             a[name] = a.zeros(count, a.variant.scalar)
-        for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely"):
+        for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
             a[name] = a.zeros(1, wp.int32)
         cloth = self.scene.cloth
         lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns

@@ -21,6 +21,9 @@ YARNS = {
 SHEAR = {(1, 2): 1000.0, (1, 3): 700.0, (2, 3): 200.0}
 """S [Pa] of a cloth of two yarns, by their numbers."""
 
+FRICTION_DAMPING = 1000.0
+"""d_f [N s/m], ten thousand times critical: the paper's yarns hardly slide."""
+
 STEP = 1e-3
 """h of the paper's simulations [s]."""
 
@@ -48,7 +51,8 @@ def cloth(
         raise InputError(f"yarns = {' '.join(map(str, yarns))}, must be two that the paper combines: {pairs}")
     make = WEAVES[choice("weave", weave, WEAVES)]
     draft = make(rows=rows, columns=columns)
-    return Cloth(draft, **{"yarns": [YARNS[k] for k in yarns], "shear": SHEAR[pair], **options})
+    numbers = {"yarns": [YARNS[k] for k in yarns], "shear": SHEAR[pair], "friction_damping": FRICTION_DAMPING}
+    return Cloth(draft, **{**numbers, **options})
 
 
 def hung(cloth: Cloth, **options: Any) -> Scene:

@@ -40,9 +40,7 @@ class Parts:
         damped: parts that the fallback made.
     """
 
-    def __init__(
-        self, model: Model, method: Any, allowed: float | None, fallback: Callable[[], Any] | None = None
-    ):
+    def __init__(self, model: Model, method: Any, allowed: float | None, fallback: Callable[[], Any] | None = None):
         self.model, self.method, self.allowed = model, method, allowed
         self._make_fallback, self._fallback = fallback, None
         self.damped = 0
@@ -74,7 +72,9 @@ class Parts:
                     gained = False
                     self._restore()
                     self._fallback = self._fallback or self._make_fallback()
+                    self.model.arrays.put("damps", 1)
                     accepted = self._try(self._fallback, count, size, left)
+                    self.model.arrays.put("damps", 0)
                     self.damped += accepted
             if not accepted:
                 self.rejected += 1

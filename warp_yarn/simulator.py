@@ -32,15 +32,15 @@ class Simulator:
             steps); see ``warp_yarn/integrators``.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
-        preconditioner: of the conjugate gradient: "incomplete" or "jacobi" (``kernels/incomplete.py``,
-            ``kernels/solver.py``).
-        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to √(b·P⁻¹b), P the preconditioner; None: 1e-6,
-            and 1e-8 where differentiable; in single precision 1e-4. In implicit stages it is that of the adjoint's
-            solves alone.
-        newton_tolerance: of an implicit stage: its residual relative to the velocity, in √energy norms, found or
-            expected of its last iteration (``CAUTION`` in ``kernels/stage.py``); None: 3e-4
-            (less where the step resolves the yarns' stretching, as its square), and 1e-8 where differentiable; in
-            single precision 3e-4.
+        preconditioner: of the conjugate gradient: "multilevel" (``kernels/multilevel.py``), "incomplete"
+            (``kernels/incomplete.py``) or "jacobi" (``kernels/solver.py``); None: "multilevel" where yarns are stiff for
+            their mass and the step, k_s h²/(m L) > 2e4, else "incomplete".
+        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to its start, which is the present velocities or 0, P
+            the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit stages
+            it is that of the adjoint's solves alone.
+        newton_tolerance: of an implicit stage: what is left of the velocities to find, relative to their change in the
+            step, as √ of kinetic energies (``decide`` in ``kernels/stage.py``); None: 1e-3 (less where the step resolves
+            the yarns' stretching, as its square), and 1e-8 where differentiable.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
             are free. They pay on large cloths (``benchmarks/bandwidth.py``).
@@ -68,7 +68,7 @@ class Simulator:
         integrator: str = "sdirk2",
         device: Any = "cpu",
         precision: str = "double",
-        preconditioner: str = "incomplete",
+        preconditioner: str | None = None,
         tolerance: float | None = None,
         newton_tolerance: float | None = None,
         max_iterations: int | None = None,

@@ -69,7 +69,12 @@ class StageMethod:
                 # two methods may work on one model, one after the other
                 if name not in a:
                     a[name] = a.zeros(count, dtype) if count else None
-        for name, value in (("unit", 1.0), ("step_length", 1.0), ("shortest", 1e30), ("inner_tolerance", INNER_TOLERANCE)):
+        for name, value in (
+            ("unit", 1.0),
+            ("step_length", 1.0),
+            ("shortest", 1e30),
+            ("inner_tolerance", INNER_TOLERANCE),
+        ):
             a.setdefault(name, a.numbers(value))
         self.set_times(model.step_size, model.step_size)
         self._graphs = Graphs(model.device)
