@@ -75,7 +75,6 @@ class Simulator:
         chunk: int | None = None,
         differentiable: bool = False,
     ):
-        options = {name: value for name, value in locals().items() if name not in ("self", "scene")}
         method = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
         self.model = Model(
             scene,
@@ -90,8 +89,6 @@ class Simulator:
             differentiable=differentiable,
         )
         self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
-        # by its name: a device of Warp's cannot be pickled
-        self._options = {**options, "device": str(self.model.device)}
         self.integrator = method(self.model)
         self.step_error = None if step_error is None else number("step_error", step_error, above=0.0)
         if step_error is not None:
@@ -109,20 +106,6 @@ class Simulator:
         self.arrays.add_frames(self.chunk + 1)
         # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
         self._upload(self._rest())
-
-    # What is on the device stays there: a copy is made from the scene, the options and the state.
-
-    def __getstate__(self) -> dict[str, Any]:
-        parts = {name: getattr(self.parts, name) for name in ("size", "tried", "made", "rejected")}
-        attributes = {"steps_done": self.steps_done, "split_steps": self.split_steps}
-        made_of = {"scene": self.scene, "options": self._options, "state": self.state}
-        return {**made_of, "attributes": attributes, "parts": parts}
-
-    def __setstate__(self, kept: dict[str, Any]) -> None:
-        self.__init__(kept["scene"], **kept["options"])
-        self._upload(kept["state"])
-        vars(self).update(kept["attributes"])
-        vars(self.parts).update(kept["parts"])
 
     # -- state -------------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ of a run. A ``Fabric`` is an ``nn.Module`` around it whose parameters are bounde
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -105,6 +106,7 @@ class Rollout:
         self.device = wp.device_to_torch(self.simulator.model.device)
         self._defaults = self._scene_values()
         self._adjoint: Adjoint | None = None
+        self._lock = threading.RLock()  # a run and its frames are one thread's until it has them
 
     def __getstate__(self) -> dict[str, Any]:
         made_of = {"scene": self.scene, "steps": self.steps, "frames": self.frames}
@@ -168,7 +170,7 @@ class Rollout:
             SimulationError: a step that could not be made.
             GradientError: where an input needs a gradient, a step that could only be made in parts.
         """
-        self._refuse_others_recording()
+        _refuse_transforms()
         steps_done = whole("steps_done", steps_done, least=0)
         if steps_done + self.steps > MOST_STEPS:
             raise InputError(f"steps_done = {steps_done}, must be at most {MOST_STEPS - self.steps}")
@@ -193,17 +195,14 @@ class Rollout:
             values["euler_velocity"] = values["euler_velocity"] * crossing[:, None]
         if "euler" in values:
             values.setdefault("anchor", values["euler"])
-        if torch.is_grad_enabled() and any(value.requires_grad for value in values.values()):
-            return Frames(*_Run.apply(self, tuple(values), steps_done, *values.values()))
-        values = {name: value.detach() for name, value in values.items()}
-        return Frames(**self._run(values, steps_done, differentiable=False)[0])
+        with self._lock:
+            if torch.is_grad_enabled() and any(value.requires_grad for value in values.values()):
+                return Frames(*_Run.apply(self, tuple(values), steps_done, *values.values()))
+            values = {name: value.detach() for name, value in values.items()}
+            return Frames(**self._run(values, steps_done, differentiable=False)[0])
 
-    def _refuse_others_recording(self) -> None:
-        """Of what a run does, recorders see launches of graphs; torch.func's transforms see no more than a number."""
-        if torch._C._are_functorch_transforms_active():  # no public function says so
-            raise InputError(
-                "a Rollout cannot be transformed by torch.func (vmap, grad, ...): use torch.autograd, in turn"
-            )
+    def _refuse_recording(self) -> None:
+        """Of what a run launches, a tape or a capture would get the first time's, or nothing."""
         if self.simulator.model.device.is_capturing:
             raise InputError("a Rollout cannot be captured in a graph: call it outside of the capture")
         try:
@@ -268,6 +267,7 @@ class Rollout:
             The frames that the call returns, and the states that the backward pass starts from. They share no memory:
             a frame that is changed in place would turn the gradient.
         """
+        self._refuse_recording()
         self._upload(values, steps_done)
         simulator, nodes, every = self.simulator, self.scene.cloth.nodes, self.checkpoint_every
         moving = [name for name in FIELDS if simulator.moves(name)]
@@ -323,7 +323,8 @@ class Rollout:
         losses: Mapping[str, torch.Tensor | None],
     ) -> list[torch.Tensor]:
         """Gradients of the wanted inputs, from those of the frames."""
-        self._refuse_others_recording()
+        _refuse_transforms(*losses.values())
+        self._refuse_recording()
         self._upload(values, steps_done)
         simulator, every = self.simulator, self.checkpoint_every
         adjoint = self._adjoint_of(wanted)
@@ -383,9 +384,30 @@ class Rollout:
         array = arrays[ARRAY_OF_PATH.get(name, name)]
         if name in ARRAY_OF_PATH and value.ndim == 3:
             array = arrays[f"{ARRAY_OF_PATH[name]}_path"]
+        repeated = None if losses.get(name) is None else losses[name].sum(dim=0)
         if array is None:  # a part of the state that this scene does not have: every frame repeats it
-            return torch.zeros_like(value) if losses[name] is None else losses[name].sum(dim=0)
-        return _flat(array.grad)[: value.numel()].reshape(value.shape).clone()
+            return torch.zeros_like(value) if repeated is None else repeated
+        gradient = _flat(array.grad)[: value.numel()].reshape(value.shape).clone()
+        if name == "anchor" and repeated is not None:  # as it does the border's, which no kernel takes back
+            border = self.scene.cloth.topology.is_crossing == 0
+            gradient[border] = repeated[border]
+        return gradient
+
+
+def _refuse_transforms(*tensors: torch.Tensor | None) -> None:
+    """Refuses what stands for other tensors, as transforms have them, and has no numbers of its own."""
+    transformed = torch._C._are_functorch_transforms_active()  # no public function says so
+    try:
+        for tensor in tensors:
+            if tensor is not None:
+                tensor.data_ptr()
+    except RuntimeError:
+        transformed = True
+    if transformed:
+        raise InputError(
+            "a Rollout cannot be transformed by torch.func (vmap, grad, ...), nor its gradients batched: call it, and "
+            "torch.autograd, one by one"
+        )
 
 
 def _range(name: str) -> dict[str, float]:
@@ -457,7 +479,8 @@ class _Gradient(torch.autograd.Function):
         losses = dict(zip(FIELDS, tensors, strict=False))
         values = dict(zip(run.names, tensors[len(FIELDS) :], strict=True))
         kept = dict(zip(run.kept_names, run.saved_tensors[len(run.names) :], strict=True))
-        return tuple(run.rollout._backward(values, run.steps_done, kept, run.wanted, losses))
+        with run.rollout._lock:
+            return tuple(run.rollout._backward(values, run.steps_done, kept, run.wanted, losses))
 
     @staticmethod
     def backward(ctx: Any, *_: Any) -> None:
@@ -566,9 +589,8 @@ class Fabric(torch.nn.Module):
                 raise InputError(f"state_dict has no range of {name!r}, without which its {key!r} means nothing")
             low, high = _pair(name, saved[name])
             if (low, high) != self.ranges[name]:
-                y = state_dict[key]
-                value = low + (high - low) * torch.sigmoid(y.to(self.rollout.dtype))
-                state_dict[key] = self._inverse(name, value).to(y.dtype)
+                value = low + (high - low) * torch.sigmoid(state_dict[key].to(self.rollout.dtype))
+                state_dict[key] = self._inverse(name, value)
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
