@@ -4,11 +4,13 @@ import io
 import itertools
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+import torch.utils.checkpoint
 import warp as wp
 
 import warp_yarn as wy
@@ -291,6 +293,19 @@ def test_two_runs_in_one_loss() -> None:
     assert torch.equal(torch.stack(torch.autograd.grad(both, values)), torch.stack(separate))
 
 
+@pytest.mark.parametrize("reentrant", [True, False])
+def test_torch_s_own_checkpoints(reentrant: bool) -> None:
+    rollout = wt.Rollout(scene_for("plain", 3), 3)
+    shear = torch.tensor(900.0, dtype=torch.float64, requires_grad=True)
+
+    def loss(shear: torch.Tensor) -> torch.Tensor:
+        return (rollout(shear=shear).position[-1] * 1e3).pow(2).sum()
+
+    (expected,) = torch.autograd.grad(loss(shear), shear)
+    torch.utils.checkpoint.checkpoint(loss, shear, use_reentrant=reentrant).backward()
+    assert torch.equal(shear.grad, expected)
+
+
 def test_torch_is_imported_when_asked_for(tmp_path) -> None:
     code = "import sys, warp_yarn as wy; assert 'torch' not in sys.modules; wy.torch.Rollout"
     # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one
@@ -567,6 +582,9 @@ def test_transforms_are_refused() -> None:
     ):
         with pytest.raises(wy.InputError, match=r"torch\.func"):
             call()
+    with warnings.catch_warnings(), pytest.raises(wy.InputError, match=r"torch\.jit"):
+        warnings.simplefilter("ignore")  # torch.jit is deprecated
+        torch.jit.trace(loss, x)
     with torch.autograd.forward_ad.dual_level(), pytest.raises(wy.GradientError, match="no forward mode"):
         loss(torch.autograd.forward_ad.make_dual(x.clone().requires_grad_(), x))
     # one by one they are right

@@ -396,6 +396,8 @@ class Rollout:
 
 def _refuse_transforms(*tensors: torch.Tensor | None) -> None:
     """Refuses what stands for other tensors, as transforms have them, and has no numbers of its own."""
+    if torch.jit.is_tracing():  # which would keep this run's frames as constants
+        raise InputError("a Rollout cannot be traced by torch.jit: torch runs none of its steps")
     transformed = torch._C._are_functorch_transforms_active()  # no public function says so
     try:
         for tensor in tensors:
@@ -458,7 +460,9 @@ class _Run(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *losses: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         ctx.wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[3:], strict=True) if needed]
-        found = _Gradient.apply(ctx, *losses, *ctx.saved_tensors[: len(ctx.names)])
+        saved, inputs = ctx.saved_tensors, len(ctx.names)  # once: torch.utils.checkpoint gives them no second time
+        kept = dict(zip(ctx.kept_names, saved[inputs:], strict=True))
+        found = _Gradient.apply(ctx, kept, *losses, *saved[:inputs])
         gradients = dict(zip(ctx.wanted, found, strict=True))
         return (None, None, None, *(gradients.get(name) for name in ctx.names))
 
@@ -475,10 +479,11 @@ class _Gradient(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, run: Any, *tensors: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+    def forward(
+        ctx: Any, run: Any, kept: dict[str, torch.Tensor], *tensors: torch.Tensor | None
+    ) -> tuple[torch.Tensor, ...]:
         losses = dict(zip(FIELDS, tensors, strict=False))
         values = dict(zip(run.names, tensors[len(FIELDS) :], strict=True))
-        kept = dict(zip(run.kept_names, run.saved_tensors[len(run.names) :], strict=True))
         with run.rollout._lock:
             return tuple(run.rollout._backward(values, run.steps_done, kept, run.wanted, losses))
 
