@@ -88,9 +88,40 @@ def same(found: list[torch.Tensor], expected: list[torch.Tensor]) -> bool:
     return len(found) == len(expected) and all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
+def fails(rollout: wt.Rollout) -> None:
+    velocity = torch.full(rollout.inputs["velocity"], 1e200, dtype=torch.float64)
+    velocity[3] = -1e200
+    rollout(velocity=velocity, friction=torch.tensor(0.1))
+
+
+def interrupt(rollout: wt.Rollout, random: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in a run, one that fails or its backward pass: before or after one of what they consist of."""
+    simulator = rollout.simulator
+    places = [(simulator, name) for name in ("run_chunk", "fail")]
+    places += [(simulator.integrator, name) for name in ("advance", "retreat", "set_times", "prepare_adjoint")]
+    owner, name = places[random.integers(len(places))]
+    left, before, real = [random.integers(4)], random.random() < 0.5, getattr(owner, name)
+
+    def interrupted(*arguments: Any) -> Any:
+        left[0] -= 1
+        if left[0] < 0 and before:
+            raise KeyboardInterrupt
+        result = real(*arguments)
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return result
+
+    with monkeypatch.context() as patch, contextlib.suppress(KeyboardInterrupt, wy.SimulationError):
+        patch.setattr(owner, name, interrupted)
+        if random.random() < 0.5:
+            fails(rollout)
+        else:
+            Call.draw(rollout, random).answer(rollout)
+
+
 def disturb(rollout: wt.Rollout, random: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Something that ends in an error, or that somebody does with the simulator within."""
-    kind = random.integers(6)
+    kind = random.integers(8)
     if kind == 0:
         with pytest.raises(wy.InputError):
             rollout(friction=-1.0, shear=3000.0, position=rollout.defaults["position"] + 1.0)
@@ -98,34 +129,20 @@ def disturb(rollout: wt.Rollout, random: np.random.Generator, monkeypatch: pytes
         with pytest.raises(wy.InputError, match="Δs"):  # found after the parameters were put in place
             rollout(shear=3000.0, gravity=torch.ones(3), euler=rollout.defaults["euler"].flip(0))
     elif kind == 2:
-        velocity = torch.full(rollout.inputs["velocity"], 1e200, dtype=torch.float64)
-        velocity[3] = -1e200
         with pytest.raises(wy.SimulationError):
-            rollout(velocity=velocity, friction=torch.tensor(0.1, requires_grad=True))
+            fails(rollout)
     elif kind == 3:
         gravity = torch.zeros(3, requires_grad=True)
         frames = rollout(gravity=gravity)
         with pytest.raises(wy.GradientError):
             (frames.velocity[-1] * float("inf")).sum().backward()
     elif kind == 4:
-        name = str(random.choice(["advance", "retreat", "set_times", "prepare_adjoint"]))
-        left, real = [random.integers(4)], getattr(rollout.simulator.integrator, name)
-
-        def interrupted(*arguments: Any) -> Any:
-            left[0] -= 1
-            if left[0] < 0:
-                raise KeyboardInterrupt
-            return real(*arguments)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(rollout.simulator.integrator, name, interrupted)
-            with contextlib.suppress(KeyboardInterrupt):
-                Call.draw(rollout, random).answer(rollout)
-    else:
         with contextlib.suppress(wy.SimulationError):  # where a run that failed left it
             rollout.simulator.energy()
             rollout.simulator.run(2)
             rollout.simulator.forces()
+    else:
+        interrupt(rollout, random, monkeypatch)
 
 
 def check_sequence(rollout: wt.Rollout, fresh: Callable[[], wt.Rollout], seed: int, patch: pytest.MonkeyPatch) -> None:
@@ -133,15 +150,15 @@ def check_sequence(rollout: wt.Rollout, fresh: Callable[[], wt.Rollout], seed: i
     pending = None
     for k in range(30):
         kind = random.random()
-        if kind < 0.25:
+        if kind < 0.4:
             disturb(rollout, random, patch)
             continue
         call = Call.draw(rollout, random)
         steps_done = int(random.integers(3))
         expected = call.answer(fresh(), steps_done=steps_done)
-        if kind < 0.35 and pending is None:  # its backward pass comes after other calls
+        if kind < 0.5 and pending is None:  # its backward pass comes after other calls
             pending = call, call.begin(rollout, steps_done=steps_done), expected
-        elif kind < 0.42:
+        elif kind < 0.57:
             with torch.no_grad():
                 assert same(list(call.begin(rollout, steps_done=steps_done)[0]), expected[:5]), (seed, k)
         else:
@@ -152,19 +169,21 @@ def check_sequence(rollout: wt.Rollout, fresh: Callable[[], wt.Rollout], seed: i
             pending = None
 
 
+# Sequences that are interrupted where a run, a step in parts or a failure would leave something behind.
+@pytest.mark.parametrize(("seed", "every"), [(5, 2), (11, 1)])
 @pytest.mark.parametrize("method", INTEGRATORS)
-def test_a_rollout_answers_as_a_fresh_one(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rollout_answers_as_a_fresh_one(method: str, seed: int, every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def fresh() -> wt.Rollout:
-        return wt.Rollout(scene(), STEPS, integrator=method, checkpoint_every=2)
+        return wt.Rollout(scene(), STEPS, integrator=method, checkpoint_every=every)
 
-    check_sequence(fresh(), fresh, 17, monkeypatch)
+    check_sequence(fresh(), fresh, seed, monkeypatch)
 
 
 @pytest.mark.parametrize(
     ("first", "then"),
     [("forces", "wind_velocity"), ("pin_path", "pin_stiffness"), ("pin_path", "position"), ("stretch", "forces")],
 )
-def test_a_gradient_is_the_same_after_another_one(first: str, then: str) -> None:
+def test_a_gradient_is_the_same_after_another_one(first: str, then: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fabric = wy.paper.cloth(rows=5, columns=5)
     pins = fabric.corners("top")
     path = np.repeat(fabric.position[pins][None], 10, axis=0)
@@ -173,13 +192,23 @@ def test_a_gradient_is_the_same_after_another_one(first: str, then: str) -> None
     )
 
     def gradient(name: str) -> torch.Tensor:
-        value = torch.ones(1) if name == "stretch" else rollout.defaults[name]
-        value = (5e5 * torch.ones(2) if name == "stretch" else value).requires_grad_()
+        value = (torch.tensor([5e5, 1.7e5]) if name == "stretch" else rollout.defaults[name]).requires_grad_()
         rollout(**{name: value}).position.square().sum().backward()
         return value.grad
 
     before = gradient(first)
     assert gradient(then).abs().max() > 0.0 and before.abs().max() > 0.0
+    assert torch.equal(gradient(first), before)
+
+    # nor where the other one was interrupted as it began
+    def interrupted(*arguments: Any) -> None:
+        prepare(*arguments)
+        raise KeyboardInterrupt
+
+    prepare = rollout.simulator.integrator.prepare_adjoint
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(rollout.simulator.integrator, "prepare_adjoint", interrupted)
+        gradient(then)
     assert torch.equal(gradient(first), before)
 
 
