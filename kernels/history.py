@@ -158,10 +158,12 @@ def define(variant: Variant) -> SimpleNamespace:
         frame_euler_grad: wp.array(dtype=scalar),
         frame_velocity_grad: wp.array(dtype=vec3),
         frame_euler_velocity_grad: wp.array(dtype=scalar),
+        frame_anchor_grad: wp.array(dtype=scalar),
         position_grad: wp.array(dtype=vec3),
         euler_grad: wp.array(dtype=scalar),
         velocity_grad: wp.array(dtype=vec3),
         euler_velocity_grad: wp.array(dtype=scalar),
+        anchor_grad: wp.array(dtype=scalar),
     ):
         """Adds what the loss asks of the present frame to the running adjoints."""
         i = index(wp.tid())
@@ -173,6 +175,8 @@ def define(variant: Variant) -> SimpleNamespace:
             euler_grad[s] = euler_grad[s] + frame_euler_grad[2 * k + d]
             if wp.static(sliding):
                 euler_velocity_grad[s] = euler_velocity_grad[s] + frame_euler_velocity_grad[2 * k + d]
+                if anchor_grad:
+                    anchor_grad[s] = anchor_grad[s] + frame_anchor_grad[2 * k + d]
 
     return SimpleNamespace(
         count=count,

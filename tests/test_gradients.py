@@ -1,13 +1,17 @@
 """Gradients of whole runs against central differences, for every input that a run takes."""
 
+import io
 import itertools
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+import torch.utils.checkpoint
+import warp as wp
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
@@ -59,7 +63,8 @@ def scaled(rollout: wt.Rollout, names: tuple[str, ...], fixed: dict[str, torch.T
     def function(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         given = {name: x * scale for name, x, scale in zip(names, inputs, scales, strict=True)}
         frames = rollout(**{**fixed, **given})
-        return frames.position / 1e-4, frames.euler / 1e-4, frames.velocity / 0.1, frames.euler_velocity / 0.01
+        scales_of_frames = (1e-4, 1e-4, 0.1, 0.01, 1e-4)
+        return tuple(values / scale for values, scale in zip(frames, scales_of_frames, strict=True))
 
     return function, start
 
@@ -295,11 +300,33 @@ def test_two_runs_in_one_loss() -> None:
     assert torch.equal(torch.stack(torch.autograd.grad(both, values)), torch.stack(separate))
 
 
+@pytest.mark.parametrize("reentrant", [True, False])
+def test_torch_s_own_checkpoints(reentrant: bool) -> None:
+    rollout = wt.Rollout(scene_for("plain", 3), 3)
+    shear = torch.tensor(900.0, dtype=torch.float64, requires_grad=True)
+
+    def loss(shear: torch.Tensor) -> torch.Tensor:
+        return (rollout(shear=shear).position[-1] * 1e3).pow(2).sum()
+
+    (expected,) = torch.autograd.grad(loss(shear), shear)
+    torch.utils.checkpoint.checkpoint(loss, shear, use_reentrant=reentrant).backward()
+    assert torch.equal(shear.grad, expected)
+
+
 @pytest.mark.slow
 def test_torch_is_imported_when_asked_for(tmp_path) -> None:
     code = "import sys, warp_yarn as wy; assert 'torch' not in sys.modules; wy.torch.Rollout"
     # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one
     assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path).returncode == 0
+    # and where it is not installed, that is an answer
+    without = """
+import sys, warp_yarn as wy
+sys.modules["torch"] = None
+assert not hasattr(wy, "torch") and getattr(wy, "torch", 1) == 1
+wy.torch
+"""
+    failed = subprocess.run([sys.executable, "-c", without], cwd=tmp_path, capture_output=True, text=True)
+    assert "AttributeError: gradients need torch: pip install warp_yarn[torch]" in failed.stderr
     with pytest.raises(AttributeError, match="no attribute 'jax'"):
         wy.jax  # noqa: B018
 
@@ -354,6 +381,60 @@ def test_gradient_descent_finds_a_parameter() -> None:
     assert fabric.value("wind_drag").item() == pytest.approx(1.0, rel=1e-4)
 
 
+# -- state_dict and ranges of a Fabric --------------------------------------------------------------------------------
+
+RANGE = {"stretch": (1e5, 1e6)}
+
+
+def test_a_state_dict_keeps_physical_values_in_other_ranges() -> None:
+    scene = scene_for("plain", 1)
+    trained = wt.Fabric(scene, 1, learn=RANGE, initial={"stretch": [5e5, 2e5]})
+    buffer = io.BytesIO()
+    torch.save(trained.state_dict(), buffer)
+    buffer.seek(0)
+    saved = torch.load(buffer, weights_only=True)
+    other = wt.Fabric(scene, 1, learn={"stretch": (0.0, 6e5), "shear": (0.0, 1e5)})
+    other.load_state_dict({**saved, "y.shear": torch.tensor(0.0), "_extra_state": {**RANGE, "shear": (0.0, 1e4)}})
+    assert torch.allclose(other.value("stretch"), torch.tensor([5e5, 2e5], dtype=torch.float64), rtol=1e-12, atol=0.0)
+    assert other.value("shear").item() == pytest.approx(5000.0, rel=1e-12)
+    assert other.ranges == {"stretch": (0.0, 6e5), "shear": (0.0, 1e5)}
+    # within a larger module, and by assignment; the given dict is left as it was
+    model = torch.nn.Sequential(wt.Fabric(scene, 1, learn={"stretch": (0.0, 6e5)}))
+    inside = {f"0.{name}": value for name, value in saved.items()}
+    model.load_state_dict(inside, assign=True)
+    assert torch.allclose(model[0].value("stretch"), trained.value("stretch"), rtol=1e-12, atol=0.0)
+    assert torch.equal(inside["0.y.stretch"], saved["y.stretch"])
+    # the same ranges: the same bits
+    same = wt.Fabric(scene, 1, learn=RANGE)
+    same.load_state_dict(saved)
+    assert torch.equal(same.y["stretch"], trained.y["stretch"])
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_state_dict_whose_values_cannot_be_kept_is_refused(strict: bool) -> None:
+    scene = scene_for("plain", 1)
+    saved = wt.Fabric(scene, 1, learn=RANGE).state_dict()
+    narrow = wt.Fabric(scene, 1, learn={"stretch": (1.5e5, 5.1e5)})
+    before = narrow.value("stretch").clone()
+    with pytest.raises(wy.InputError, match="strictly between 150000 and 510000"):
+        wide = wt.Fabric(scene, 1, learn=RANGE, initial={"stretch": [9e5, 2e5]})
+        narrow.load_state_dict(wide.state_dict(), strict=strict)
+    without = {name: value for name, value in saved.items() if name != "_extra_state"}
+    for bad in (without, {**saved, "_extra_state": {"shear": (0.0, 1.0)}}):
+        with pytest.raises(wy.InputError, match="no range of 'stretch'"):
+            narrow.load_state_dict(bad, strict=strict)
+    for pair in ((6e5, 1e5), (0.0, float("inf")), "ab", 1.0):
+        with pytest.raises(wy.InputError, match=r"learn\['stretch'\]"):
+            narrow.load_state_dict({**saved, "_extra_state": {"stretch": pair}}, strict=strict)
+    assert torch.equal(narrow.value("stretch"), before)
+
+
+def test_a_fabric_starts_from_the_scene_s_own_digits() -> None:
+    fabric = wt.Fabric(scene_for("plain", 1), 1, learn={"density": (1e-3, 3e-3), "anchor": (-1.0, 1.0)})
+    assert fabric.value("density").tolist() == pytest.approx([2.0e-3, 2.5e-3], rel=1e-14)
+    assert torch.allclose(fabric.value("anchor"), fabric.rollout.defaults["euler"], rtol=0.0, atol=1e-15)
+
+
 # -- what is refused --------------------------------------------------------------------------------------------------
 
 
@@ -365,6 +446,20 @@ def test_gradient_descent_finds_a_parameter() -> None:
         ({"shear": torch.zeros(2)}, r"shear has shape \(2,\), must be \(\)"),
         ({"stretch": torch.tensor([5e5, float("nan")])}, "stretch is not finite"),
         ({"stretch": torch.ones(2), "yarn_stretch": torch.ones(9)}, "both given"),
+        ({"stretch": torch.tensor([5e5, -1.0])}, r"stretch\[1\] = -1\.0, must be finite and at least 0"),
+        ({"yarn_density": np.arange(9)}, r"yarn_density\[0\] = 0\.0, must be finite and above 0"),
+        ({"gravity": torch.ones(3, dtype=torch.complex128)}, "complex.*real"),
+        ({"gravity": [1j, 0, 0]}, "real numbers"),
+        ({"gravity": torch.ones(3).to_sparse()}, "dense"),
+        ({"gravity": "down"}, "gravity must be a tensor"),
+        ({"gravity": None}, "gravity must be a tensor"),
+        ({"gravity": [1, [2], 3]}, "gravity must be a tensor"),
+        # as an array it would lose its gradient
+        ({"gravity": [torch.ones((), requires_grad=True)] * 3}, "gravity must be a tensor.*requires grad"),
+        ({"steps_done": -1}, "steps_done = -1"),
+        ({"steps_done": 2**31 - 1}, "steps_done.*must be at most 2147483646"),
+        ({"state": 5}, "state = 5, must be a State"),
+        ({"state": wy.Simulator(scene_for("plain", 1)).state, "anchor": torch.zeros(20, 2)}, "state and anchor"),
     ],
 )
 def test_bad_inputs(inputs: dict[str, torch.Tensor], message: str) -> None:
@@ -372,10 +467,51 @@ def test_bad_inputs(inputs: dict[str, torch.Tensor], message: str) -> None:
         wt.Rollout(scene_for("plain", 1), 1)(**inputs)
 
 
-@pytest.mark.parametrize("frames", [[], [3, 2], [0, 9], [-1]])
+def made_with(name: str, value: float) -> None:
+    """The same input where it is no tensor."""
+    yarn, pinned = {"density": 2e-3, "stretch": 5e5, "bend": 1.4e-4}, cloth()
+    if name in yarn:
+        wy.Yarn(**{**yarn, name: value})
+    elif name.startswith("wind_"):
+        wy.Wind(velocity=(0.0, 5.0, 0.0), **{name.removeprefix("wind_"): value})
+    elif name == "pin_stiffness":
+        wy.Scene(pinned, pins=[0], pin_stiffness=value)
+    else:
+        cloth(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["density", "stretch", "bend", *wt.NUMBERS])
+@pytest.mark.parametrize("value", [-1e-4, -0.0, 0.0, 1e-3, float("inf")])
+def test_tensors_have_the_ranges_of_numbers(name: str, value: float) -> None:
+    rollout = wt.Rollout(scene_for("plain", 1), 1, integrator="linear")
+    allowed = True
+    try:
+        made_with(name, value)
+    except wy.InputError:
+        allowed = False
+    tensor = torch.full(rollout.inputs[name], value, dtype=torch.float64)
+    try:
+        rollout(**{name: tensor})
+    except wy.InputError:
+        assert not allowed
+    except wy.SimulationError:  # such yarns cannot be simulated, which is another thing
+        assert allowed
+    else:
+        assert allowed
+
+
+@pytest.mark.parametrize(
+    "frames", [[], [3, 2], [0, 9], [-1], [1.5, 2.7], [True, False, True], 5, "1", [[1, 2]], [0, 0], np.uint8([2, 1])]
+)
 def test_bad_frames(frames: list[int]) -> None:
     with pytest.raises(wy.InputError, match="frames"):
         wt.Rollout(scene_for("plain", 1), 5, frames=frames)
+
+
+@pytest.mark.parametrize("options", [{"chunk": 3}, {"differentiable": False}])
+def test_options_that_a_rollout_settles_itself(options: dict) -> None:
+    with pytest.raises(wy.InputError, match="checkpoint_every"):
+        wt.Rollout(scene_for("plain", 1), 5, **options)
 
 
 @pytest.mark.parametrize(
@@ -384,11 +520,107 @@ def test_bad_frames(frames: list[int]) -> None:
         ({"learn": {"spacing": (0.0, 1.0)}}, "learn names 'spacing'"),
         ({"learn": {"shear": (1.0, 1.0)}}, "must be above"),
         ({"learn": {"shear": (0.0, 500.0)}}, "strictly between 0 and 500"),
+        ({"learn": {"friction": (-1.0, 1.0)}}, r"learn\['friction'\]\[0\] = -1\.0.*at least 0"),
+        ({"learn": {"shear": (0.0, float("inf"))}}, r"learn\['shear'\]\[1\] = inf.*finite"),
+        ({"learn": {"shear": 5.0}}, r"learn\['shear'\] = 5\.0, must be two numbers"),
+        ({"learn": ["shear"]}, "must be a dict"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": {"strech": 5e5}}, "initial = 'strech', must be one of shear"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": {"bend": 1e-4}}, "initial = 'bend', must be one of shear"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": {"shear": "stiff"}}, "shear must be a tensor"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": {"shear": 1j}}, "shear must be a tensor.*real"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": {"shear": [1.0, 2.0]}}, r"shear has shape \(2,\)"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": {"shear": float("nan")}}, "strictly between"),
+        ({"learn": {"shear": (0.0, 2000.0)}, "initial": 1000.0}, "initial = 1000.0, must be a dict"),
     ],
 )
 def test_bad_fabric(options: dict, message: str) -> None:
     with pytest.raises(wy.InputError, match=message):
         wt.Fabric(scene_for("plain", 1), 1, **options)
+
+
+def test_a_fabric_refuses_names_that_it_does_not_learn() -> None:
+    fabric = wt.Fabric(scene_for("plain", 1), 1, learn={"shear": (0.0, 2000.0)})
+    for call in (lambda: fabric.set("stretch", 1.0), lambda: fabric.value("sheer")):
+        with pytest.raises(wy.InputError, match="must be one of shear"):
+            call()
+    with pytest.raises(wy.InputError, match="shear is learned"):
+        fabric(shear=torch.tensor(1.0))
+
+
+def of_stretch(rollout: wt.Rollout) -> Callable[[torch.Tensor], torch.Tensor]:
+    """A loss that is linear in the frames: their gradients do not depend on anything."""
+    return lambda stretch: rollout(stretch=1e5 * stretch).position[-1].sum()
+
+
+def test_second_derivatives_are_refused() -> None:
+    loss = of_stretch(wt.Rollout(scene_for("plain", 2), 2))
+    x = torch.tensor([5.0, 1.7], dtype=torch.float64)
+    weights = torch.randn(2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    functional = torch.autograd.functional
+    asked = {
+        "hessian": lambda: functional.hessian(lambda d: loss(d) + d.square().sum(), x),
+        "hvp": lambda: functional.hvp(loss, x, weights),
+        "jvp": lambda: functional.jvp(loss, x, weights),  # by the gradient of a gradient
+        "of a square": lambda: functional.hessian(lambda d: loss(d).square(), x),
+    }
+    for name, call in asked.items():
+        with pytest.raises(wy.GradientError, match="no second derivatives") as error:
+            call()
+        assert error.value.step is None, name
+    # a penalty on the gradient: the first one is right, what comes of it is refused
+    leaf = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
+    (expected,) = torch.autograd.grad(loss(leaf), leaf)
+    assert torch.equal(gradient, expected)
+    with pytest.raises(wy.GradientError, match="no second derivatives"):
+        gradient.square().sum().backward()
+
+
+def test_transforms_are_refused() -> None:
+    rollout = wt.Rollout(scene_for("plain", 2), 2)
+    loss, x = of_stretch(rollout), torch.tensor([5.0, 1.7], dtype=torch.float64)
+    frames_of = lambda d: rollout(stretch=1e5 * d).position[-1, 3]  # noqa: E731
+    for call in (
+        lambda: torch.func.grad(loss)(x),
+        lambda: torch.func.vmap(loss)(torch.stack([x, x])),
+        lambda: torch.func.jvp(loss, (x,), (x,)),
+        lambda: torch.func.jacrev(loss)(x),
+        # gradients of several losses at once
+        lambda: torch.autograd.functional.jacobian(frames_of, x, vectorize=True),
+    ):
+        with pytest.raises(wy.InputError, match=r"torch\.func"):
+            call()
+    with warnings.catch_warnings(), pytest.raises(wy.InputError, match=r"torch\.jit"):
+        warnings.simplefilter("ignore")  # torch.jit is deprecated
+        torch.jit.trace(loss, x)
+    with torch.autograd.forward_ad.dual_level(), pytest.raises(wy.GradientError, match="no forward mode"):
+        loss(torch.autograd.forward_ad.make_dual(x.clone().requires_grad_(), x))
+    # one by one they are right
+    rows = torch.autograd.functional.jacobian(frames_of, x)
+    leaf = x.clone().requires_grad_()
+    (first,) = torch.autograd.grad(frames_of(leaf)[0], leaf)
+    assert torch.equal(rows[0], first)
+
+
+def test_recording_by_warp_is_refused() -> None:
+    rollout = wt.Rollout(scene_for("plain", 2), 2)
+    x = torch.tensor([5.0, 1.7], dtype=torch.float64, requires_grad=True)
+
+    def value(rollout: wt.Rollout) -> list:
+        output = of_stretch(rollout)(x)
+        return [output.item(), *torch.autograd.grad(output, x)[0].tolist()]
+
+    expected, others = value(rollout), of_stretch(rollout)(x)
+    fresh = wt.Rollout(rollout.scene, 2)
+    for recording, what in ((wp.Tape, "Tape"), (lambda: wp.ScopedCapture(device="cpu"), "capture")):
+        for call in (
+            lambda: rollout(),
+            lambda: fresh(stretch=1e5 * x),
+            lambda: torch.autograd.grad(others, x, retain_graph=True),
+        ):
+            with recording(), pytest.raises(wy.InputError, match=what):
+                call()
+        assert value(fresh) == expected and value(rollout) == expected
 
 
 def test_forward_failure_raises_the_forward_error() -> None:

@@ -16,12 +16,9 @@ from .kernels.step import NOT_FINITE
 from .model import PATHS
 from .simulator import Simulator
 
-FRAMES = ("position", "euler", "velocity", "euler_velocity")
-"""What a loss may ask of every frame."""
-
 
 class Adjoint:
-    """Differentiates runs of a simulator.
+    """Differentiates runs of a simulator, which has one at a time: its integrator records for the last one.
 
     Args:
         simulator: the simulator; its parameter arrays hold the values to differentiate at.
@@ -37,17 +34,16 @@ class Adjoint:
         self.moving = [name for name in PATHS if name in parameters and f"{name}_path" in a]
         self.wanted = (*STATE_TYPES, *parameters, *(f"{name}_path" for name in self.moving))
         a.require_grad(*self.wanted)
-        for name in FRAMES:
+        for name in STATE_TYPES:
             # of the loss, by frame of a chunk; (u, v) has one even where it does not change: it may be an input
             if f"loss_{name}" not in a:
-                vector = STATE_TYPES[name] == 3
-                count = (simulator.chunk + 1) * a["nodes"] * (1 if vector else 2)
-                a[f"loss_{name}"] = a.zeros(count, a.variant.vec3 if vector else a.variant.scalar)
+                array, frames = a[name], simulator.chunk + 1
+                a[f"loss_{name}"] = None if array is None else a.zeros(frames * array.shape[0], array.dtype)
         simulator.integrator.prepare_adjoint(self._receive, self._give)
 
     def _receive(self) -> None:
         """Takes in what the loss asks of the present frame."""
-        frames = {f"frame_{name}_grad": self.arrays[f"loss_{name}"] for name in FRAMES}
+        frames = {f"frame_{name}_grad": self.arrays[f"loss_{name}"] for name in STATE_TYPES}
         self.simulator.model.launch("receive", "nodes", **frames)
 
     def _give(self, stage: int) -> None:
@@ -55,22 +51,29 @@ class Adjoint:
         for name in self.moving:
             self.simulator.model.give_inputs(name, stage)
 
+    def release(self) -> None:
+        """Gives the gradients of parameters up, before another one asks for other parameters."""
+        for name in self.wanted:
+            if name not in STATE_TYPES and self.arrays[name] is not None:
+                self.arrays[name].requires_grad = False
+
     def clear(self) -> None:
         """Sets every gradient that a run adds to back to 0."""
         self.arrays.zero_grad(*self.wanted)
 
-    def backward_chunk(self, first: int, steps: int) -> None:
+    def backward_chunk(self, first: int, steps: int, before: int = 0) -> None:
         """Goes back over the steps of a chunk whose frames are on the device, to the chunk's first frame.
 
         Args:
-            first: step, since the beginning, that the chunk started at.
+            first: step of the run that the chunk started at.
             steps: how many steps it made.
+            before: steps made before the run, by which moving pins and applied forces are looked up.
 
         Raises:
             GradientError: where an adjoint is not finite, or its solve does not converge.
         """
         a = self.arrays
-        a.put("counters", steps, first + steps)
+        a.put("counters", steps, before + first + steps)
         with self.simulator.model.team():
             for k in range(steps, 0, -1):
                 self.simulator.integrator.retreat()

@@ -39,11 +39,11 @@ class GradientError(WarpYarnError, RuntimeError):
     """A gradient that could not be computed.
 
     Attributes:
-        step: number of the step, counted from 1 in this run; 0 is the initial state.
+        step: number of the step, counted from 1 in this run; 0 is the initial state; None: of no single step.
         term: the kernel whose reverse is to blame, or None.
     """
 
-    def __init__(self, message: str, *, step: int, term: str | None):
+    def __init__(self, message: str, *, step: int | None, term: str | None):
         super().__init__(message)
         self.step, self.term = step, term
 
