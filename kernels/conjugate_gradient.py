@@ -220,7 +220,7 @@ def define(variant: Variant) -> SimpleNamespace:
         residual: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times what it was at the start, in one launch of one thread a strip.
+        """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch of one thread a strip.
 
         Strip 0 solves once; others are helpers that wait for one solve after the other until they are sent home.
         What is held has an E⁻¹ of 0: it keeps its value, and enters the right-hand side through the first residual.

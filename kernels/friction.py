@@ -164,4 +164,36 @@ def define_anchor(variant: Variant) -> wp.Kernel:
     return drag_anchor
 
 
-TERM = Term(name="friction", elements="crossings", define=define, needs_contact=True, sliding_only=True)
+def define_energy(variant: Variant) -> wp.Kernel:
+    scalar = variant.scalar
+
+    @variant.kernel("energy")
+    def friction_energy(
+        crossing_node: wp.array(dtype=int),
+        friction: wp.array(dtype=scalar),
+        friction_stiffness: wp.array(dtype=scalar),
+        euler: wp.array(dtype=scalar),
+        anchor: wp.array(dtype=scalar),
+        contact_load: wp.array(dtype=scalar),
+        energy: wp.array(dtype=scalar),
+    ):
+        """What friction's springs can give back: the work of their force, at most μF_n, on the way to the anchor."""
+        i = crossing_node[wp.tid()]
+        limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
+        for direction in range(2):
+            delta = wp.abs(euler[2 * i + direction] - anchor[2 * i + direction])
+            spring = wp.min(delta, limit / friction_stiffness[0])
+            stored = scalar(0.5) * friction_stiffness[0] * spring * spring + limit * (delta - spring)
+            wp.atomic_add(energy, 0, stored)
+
+    return friction_energy
+
+
+TERM = Term(
+    name="friction",
+    elements="crossings",
+    define=define,
+    energy=define_energy,
+    needs_contact=True,
+    sliding_only=True,
+)

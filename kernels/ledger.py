@@ -1,14 +1,14 @@
 """A watch over energy: what a step leaves may not be more than what there was and the work that was done since.
 
-    T + V_stretch + V_pins + V_gravity  ≤  E + W + 1 % of what there is of it beside gravity
+    T + V_stretch + V_pins + V_gravity  ≤  E + W + g × what there is of it beside gravity
 
 E is the whole energy at the last audit, all terms' energies at the beginning of a step, which is made every
 ``EVERY`` steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken
 for a gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a
-while after a gain. W is the work of wind, applied forces and moving pins since. The same must hold from the start of the
-run on.
+while after. W is the work of wind, applied forces and moving pins since. The same must hold from the run's start on.
 
-A run that fails here would blow up, or be wrong without saying so.
+g is ``GAIN`` where a method makes a step that gains again, damped. A method that does not damp, and a run that must
+have a gradient, are stopped only where energy doubles: they would blow up, or be wrong without saying so.
 """
 
 import functools
@@ -23,8 +23,9 @@ from .variant import Variant
 EVERY = 16
 """Steps between audits: at 16 an audit takes 1 % of a step of the paper's cloth."""
 GAIN = 0.01
-"""Part of the energy that a step may gain: friction's springs and shear's dependence on the contact force have no
-energy of their own in the sum."""
+"""Part of the energy that a step may gain: shear's dependence on the contact force has no energy of its own."""
+BLOW_UP = 1.0
+"""The same of methods that have nothing to fall back on."""
 SUDDEN = 0.1
 """Part of the energy that yarns give or take in a step that is looked at closely."""
 ALERT = 16
@@ -42,8 +43,8 @@ def define(variant: Variant) -> SimpleNamespace:
     def audit(
         energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
-        # E + W since the last audit, and since the start; energy beside gravity at the last audit; the last step's power,
-        # and its yarns' energy
+        # E + W since the last audit, and since the start; energy beside gravity at the last audit; the last step's
+        # power, and its yarns' energy
         elastic_energy: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
         begun: wp.array(dtype=int),
@@ -65,10 +66,23 @@ def define(variant: Variant) -> SimpleNamespace:
         audit_due[0] = 0
 
     @wp.kernel(module=module, enable_backward=False)
-    def add_power(force: wp.array(dtype=vec3), velocity: wp.array(dtype=vec3), power: wp.array(dtype=scalar)):
-        """Power of outer forces."""
+    def add_power(
+        force: wp.array(dtype=vec3),
+        outer_force: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        power: wp.array(dtype=scalar),
+    ):
+        """Power of outer forces, and what it would be with those at the beginning of the step."""
         i = index(wp.tid())
         wp.atomic_add(power, 0, wp.dot(force[i], velocity[i]))
+        wp.atomic_add(power, 1, wp.dot(outer_force[i], velocity[i]))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def keep_outer_force(status: wp.array(dtype=int), force: wp.array(dtype=vec3), outer_force: wp.array(dtype=vec3)):
+        """The forces at the beginning of the next step, if this one is good."""
+        i = index(wp.tid())
+        if status[0] == 0:
+            outer_force[i] = force[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def add_pin_power(
@@ -105,6 +119,7 @@ def define(variant: Variant) -> SimpleNamespace:
         elastic_energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
         power: wp.array(dtype=scalar),
+        gain: wp.array(dtype=scalar),
         still_energy: wp.array(dtype=scalar),
         step_size: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
@@ -116,16 +131,17 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """Compares the end of a step with the bounds, which move on if the step is good."""
         if status[0] == 0:
-            # the larger power of the step's two ends: between them it may have been either
-            work = wp.max(power[0], bounds[3]) * step_size[0]
+            # methods take the force or the velocity of either end: the largest that the power may have been
+            work = wp.max(wp.max(power[0], power[1]), bounds[3]) * step_size[0]
             inner = energy[0] + elastic_energy[0]
             total = inner + height_energy[0]
-            room = scalar(GAIN) * wp.max(inner, bounds[2]) + still_energy[0]
+            room = gain[0] * wp.max(inner, bounds[2]) + still_energy[0]
             room += scalar(1.0e-9) * wp.abs(height_energy[0])
             bound = wp.min(bounds[0], bounds[1])
             if damps[0] != 0:
-                # there is no surer method: only what there was at the start counts
+                # there is no surer method: it only may not blow up
                 bound = bounds[1]
+                room = wp.max(room, scalar(BLOW_UP) * wp.max(inner, bounds[2]))
             if not (total <= bound + work + room):
                 status[0] = wp.static(GAINED)
                 status[1] = -1
@@ -140,5 +156,10 @@ def define(variant: Variant) -> SimpleNamespace:
                 audit_due[0] = wp.where(steps_to_audit[0] <= 0, 1, 0)
 
     return SimpleNamespace(
-        audit=audit, add_power=add_power, add_pin_power=add_pin_power, suspect=suspect, close_step=close_step
+        audit=audit,
+        add_power=add_power,
+        keep_outer_force=keep_outer_force,
+        add_pin_power=add_pin_power,
+        suspect=suspect,
+        close_step=close_step,
     )

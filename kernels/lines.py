@@ -243,10 +243,11 @@ _SOLVE = """
             // Gᵀ of the node behind
             const SCALAR* g = factor.data + (size_t)(e + 1) * 8 * K;
             const row p0 = column(g, 0) * x, p1 = column(g, 1) * x, p2 = column(g, 2) * x;
-            row taken = {p0[0] + p0[1] + p0[2] + p0[3], p1[0] + p1[1] + p1[2] + p1[3], p2[0] + p2[1] + p2[2] + p2[3], 0};
+            auto sum = [](row p) { return p[0] + p[1] + p[2] + p[3]; };
+            row taken = {sum(p0), sum(p1), sum(p2), 0};
 #if K == 4
             const row p3 = column(g, 3) * x;
-            taken[3] = p3[0] + p3[1] + p3[2] + p3[3];
+            taken[3] = sum(p3);
 #endif
             a = a - taken;
         }

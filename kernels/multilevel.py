@@ -2,7 +2,7 @@
 
     P⁻¹ = lines of A + Σ over levels R (lines of RᵀAR) Rᵀ + R (RᵀAR)⁻¹ Rᵀ of the last one
 
-R interpolates bilinearly from every 2nd, 4th, 8th ... yarn to the cloth. Lines solve exactly along yarns (``lines.py``),
+R interpolates bilinearly from every 2nd, 4th, 8th … yarn to the cloth. Lines solve exactly along yarns (``lines.py``),
 levels take what is smooth across them, so the iterations depend on neither the number of yarns nor their stiffness,
 where those of the incomplete factorization grow with both. All parts are added up, so they can be solved at the same
 time, and each is positive definite, so P is. Rates of sliding have lines, and no part in the levels.
@@ -252,7 +252,7 @@ def define(variant: Variant) -> SimpleNamespace:
     def factorize_coarsest(first: int, count: int, levels: Levels):
         """The Cholesky factor of the last level, row by row, with the inverse of its diagonal."""
         size = 3 * count
-        l = levels.coarsest
+        lower = levels.coarsest
         for i in range(count):
             for j in range(i, count):
                 slot = at(levels.coarsest_slot, count * i + j)
@@ -261,18 +261,18 @@ def define(variant: Variant) -> SimpleNamespace:
                     block = at(levels.coarse_block, BLOCKS * (first + i) + slot)
                 for k in range(3):
                     for m in range(3):
-                        put(l, size * (3 * j + m) + 3 * i + k, block[k, m])
+                        put(lower, size * (3 * j + m) + 3 * i + k, block[k, m])
         for j in range(size):
-            diagonal = at(l, size * j + j)
+            diagonal = at(lower, size * j + j)
             for i in range(j, size):
-                value = at(l, size * i + j)
+                value = at(lower, size * i + j)
                 for k in range(j):
-                    value -= at(l, size * i + k) * at(l, size * j + k)
+                    value -= at(lower, size * i + k) * at(lower, size * j + k)
                 if i == j:
                     safe = diagonal > scalar(0.0) and value > scalar(wp.static(SAFE[scalar])) * diagonal
-                    put(l, size * j + j, wp.where(safe, scalar(1.0) / wp.sqrt(value), scalar(0.0)))
+                    put(lower, size * j + j, wp.where(safe, scalar(1.0) / wp.sqrt(value), scalar(0.0)))
                 else:
-                    put(l, size * i + j, value * at(l, size * j + j))
+                    put(lower, size * i + j, value * at(lower, size * j + j))
 
     @wp.func
     def solve_coarsest(levels: Levels, first: int, count: int):

@@ -36,7 +36,7 @@ SLOW = 0.3
 """Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
 CAUTION = 4.0
-"""What a step of the iteration leaves is taken to be so many times what the worst contraction of this time step says."""
+"""What a step of the iteration leaves is taken to be so many times what the contraction before it says."""
 TURNING = 0.03
 """Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one
 iteration did with that of the first stage, above 0.045, two to seven, and one or two with its own (17 × 17)."""
@@ -209,7 +209,9 @@ def define(variant: Variant) -> SimpleNamespace:
         if status[0] == 0:
             residual[0] = norm / wp.max(change[0], scalar(1.0e-30))
         finishes[0] = 0
-        if norm == scalar(0.0) or (step_length[0] == scalar(1.0) and left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]):
+        if norm == scalar(0.0) or (
+            step_length[0] == scalar(1.0) and left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]
+        ):
             finishes[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)

@@ -35,7 +35,7 @@ def on_all_cores(monkeypatch):
 def test_ours_and_scipy_solve_the_same_system_to_the_same_tolerance():
     ours = solver.simulators(5)
     result = solver.compare(ours)
-    assert set(result) == {"incomplete", "jacobi", "scipy"}
+    assert set(result) == {"default", "jacobi", "scipy"}
     # The tolerance is 1e-8 in the residual. The error is that times at most the condition number of the scaled matrix,
     # here some 1e3, and far less as a rule.
     for solution in result.values():
@@ -43,7 +43,7 @@ def test_ours_and_scipy_solve_the_same_system_to_the_same_tolerance():
     # The same iterates, but for rounding: one may pass the tolerance an iteration before the other.
     assert abs(result["jacobi"]["iterations"] - result["scipy"]["iterations"]) <= 1
     assert result["jacobi"]["error"] == pytest.approx(result["scipy"]["error"], rel=0.5)
-    assert result["incomplete"]["iterations"] < result["jacobi"]["iterations"] / 3
+    assert result["default"]["iterations"] < result["jacobi"]["iterations"] / 3
 
 
 def test_a_row_reaches_the_csv_file_with_the_environment(tmp_path):

@@ -187,10 +187,10 @@ def test_directional_derivatives(method: str, group: str) -> None:
                     loss(*moved) - loss(*(m - 2 * h * direction if i == k else m for i, m in enumerate(moved)))
                 )
 
-        h = 1e-5
+        h = 3e-6
         differences = [along(h) / (2.0 * h), along(2.0 * h) / (4.0 * h)]
         expected = (4.0 * differences[0] - differences[1]) / 3.0
-        # differences of numbers near 1 that Newton's iteration leaves 1e-12 uncertain, over 1e-5
+        # differences of numbers near 1 that Newton's iteration leaves 1e-12 uncertain, over 3e-6
         assert found == pytest.approx(expected, rel=1e-5, abs=1e-6), name
 
 
@@ -218,35 +218,29 @@ def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
     def tolerance(step: float, **options: object) -> float:
         return wy.Simulator(wy.Scene(fabric), step=step, **options).model.newton_tolerance_at(step)
 
-    assert tolerance(1e-2) == tolerance(4.001 * wave) == 3e-4
-    assert tolerance(wave) == pytest.approx(3e-4 / 16, rel=1e-12)
+    assert tolerance(1e-2) == tolerance(4.001 * wave) == 1e-3
+    assert tolerance(wave) == pytest.approx(1e-3 / 16, rel=1e-12)
     assert tolerance(1e-9) == tolerance(wave, differentiable=True) == 1e-8
-    assert tolerance(wave, precision="single") == 3e-4
+    assert tolerance(wave, precision="single") == 1e-3
 
 
 @pytest.mark.parametrize("step", [2e-3, 5e-4, 1.25e-4])
 def test_the_iteration_that_is_not_looked_at_gets_there(step: float) -> None:
-    """The residual of the last stage of each step, in the norms of ``judge``, after all."""
+    """What is left at the end of each step's last stage, by another step of the iteration, after all."""
     simulator = wy.Simulator(wy.paper.hung_cloth("plain", 5, 5, (1, 2)), step=step)
     arrays, left, skipped = simulator.arrays, [], 0
-
-    def square(value: str, inverse: str, *, of_inverse: bool) -> float:
-        x, weight = arrays[value].numpy(), arrays[inverse].numpy()
-        moves = weight > 0.0
-        return float((x[moves] ** 2 * (weight[moves] if of_inverse else 1.0 / weight[moves])).sum())
-
+    arrays["inner_tolerance"].fill_(1e-10)
     for _ in range(20):
         simulator.run(1)
         skipped += int(arrays["finishes"].numpy()[0])
-        simulator.integrator._evaluate(matrix=False)
-        residual = square("rhs", "inverse_x", of_inverse=True) + square("euler_rhs", "inverse_s", of_inverse=True)
-        size = square("solution", "inverse_x", of_inverse=False) + square(
-            "euler_solution", "inverse_s", of_inverse=False
-        )
-        left.append(np.sqrt(residual / size) / simulator.model.newton_tolerance_at(step))
+        change = float(arrays["change"].numpy()[0])
+        simulator.integrator._evaluate(matrix=True)
+        simulator.integrator._solve_direction(1)
+        slope = float(arrays["slope"].numpy()[0])
+        left.append(np.sqrt(slope) / change / simulator.model.newton_tolerance_at(step))
     assert skipped >= 5
-    # of 1300 such stages, the worst was at 9 times its tolerance; at 2 ms a cloth as small as this has the most above
-    assert np.median(left) < (2.0 if step > 1e-3 else 1.0) and max(left) < 10.0
+    # contraction is not the same from one iteration to the next; the worst of these was at 7 times its tolerance
+    assert np.median(left) < 1.0 and max(left) < 10.0
 
 
 def test_unknown_method_is_refused() -> None:
@@ -293,7 +287,7 @@ def test_a_step_that_fails_is_made_in_parts() -> None:
     fine.state = state
     assert np.array_equal(fine.run(4).position[-1], trajectory.position[1])
     # the next steps are whole again, and are those of a simulator that starts there
-    other = wy.Simulator(scene)
+    other = wy.Simulator(scene, newton_tolerance=3e-4)
     other.state = trajectory[1]
     assert np.array_equal(other.run(4).position, trajectory.position[1:])
 

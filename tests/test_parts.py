@@ -77,7 +77,8 @@ def test_parts_keep_to_the_allowed_error(swinging: wy.State) -> None:
 def test_parts_add_up_to_the_step() -> None:
     """A cloth in free fall has no third derivative, so parts grow to whole steps; exact pins reach their places."""
     fabric = cloth(4, 4)
-    simulator = wy.Simulator(wy.Scene(fabric), step=4e-3, step_error=1e-6, **EXACT)
+    # springs of friction that are not strained at rest move by 1e-10 m
+    simulator = wy.Simulator(wy.Scene(fabric, sliding=False), step=4e-3, step_error=1e-6, **EXACT)
     simulator.parts.size = 0.1
     fallen = simulator.run(3).position[-1] - fabric.position
     # SDIRK2 is exact for a parabola

@@ -20,8 +20,8 @@ COARSEST = 9
 FEWEST = 3
 """Yarns of a direction that are not coarsened further."""
 OFFSETS = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
-"""Where the upper neighbours of a coarse node are, in (warp yarns, weft yarns): nothing else comes of R Aₗ Rᵀ, neither of
-the cloth's stencil nor of this one."""
+"""Where the upper neighbours of a coarse node are, in (warp yarns, weft yarns): nothing else comes of R Aₗ Rᵀ, neither
+of the cloth's stencil nor of this one."""
 BLOCKS = 1 + len(OFFSETS)
 """Matrix blocks of a coarse node: its own, and those of its upper neighbours."""
 

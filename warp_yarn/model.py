@@ -18,8 +18,8 @@ import warp as wp
 
 from .arrays import Arrays
 from .errors import InputError, choice, number, whole
-from .kernels import Variant, build
-from .kernels.ledger import STILL
+from .kernels import Term, Variant, build
+from .kernels.ledger import BLOW_UP, STILL
 from .levels import BLOCKS
 from .scene import Scene
 
@@ -47,8 +47,8 @@ TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
 NEWTON_TOLERANCE = 1e-3
 STIFF = 2e4
-"""k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch wave
-runs over a hundred crossings in a step."""
+"""k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch
+wave runs over a hundred crossings in a step."""
 RESOLVED = 4.0
 """Of steps that do not resolve the yarns' vibrations: a stretch wave runs from a crossing to the next in less than the
 ``RESOLVED``-th part of a step. A tenth at most is then added to the error of the second-order methods. The error of
@@ -373,7 +373,7 @@ class Model:
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
         self.watches = not (self.held and self.scene.pin_path is not None)
-        for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 1), ("bounds", 5)):
+        for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 2), ("bounds", 5)):
             a[name] = a.zeros(count, a.variant.scalar)
         for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
             a[name] = a.zeros(1, wp.int32)
@@ -381,6 +381,9 @@ class Model:
         lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
         mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
         a["still_energy"] = a.numbers(0.5 * mass * STILL**2)
+        if self._outer:
+            a["outer_force"] = a.zeros(a["nodes"], a.variant.vec3)
+        a["gain"] = a.numbers(BLOW_UP)
         self.forget_energy()
 
     def forget_energy(self) -> None:
@@ -399,6 +402,8 @@ class Model:
         self.arrays.zero("energy", "elastic_energy", "height_energy")
         self._add_energies(cheap=True)
         self._add_energies(cheap=False)
+        if self._outer:
+            self._add_outer_forces("outer_force")
         self.launch("audit", 1)
 
     def _add_energies(self, *, cheap: bool) -> None:
@@ -411,15 +416,34 @@ class Model:
     def _close_step(self) -> None:
         """Compares the energy at the end of a step with the work done in it."""
         a = self.arrays
-        a.zero("energy", "elastic_energy", "height_energy", "power")
+        a.zero("energy", "elastic_energy", "height_energy")
         self._add_energies(cheap=True)
         self.launch("suspect", 1)
         wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
-        for term in a.terms:
-            if term.name in OUTER_FORCES:
-                a.zero("q_x")
-                self.launch(term.name, term.elements, matrix=0, press=0, force=a["q_x"])
-                self.launch("add_power", "nodes", force=a["q_x"])
+        self._add_powers()
+        self.launch("close_step", 1)
+        if self._outer:
+            self.launch("keep_outer_force", "nodes", force=a["q_x"])
+
+    @property
+    def _outer(self) -> list[Term]:
+        """Terms that do work on the cloth and have no energy."""
+        return [term for term in self.arrays.terms if term.name in OUTER_FORCES]
+
+    def _add_outer_forces(self, target: str) -> None:
+        """Fills an array with outer forces at the present state."""
+        a = self.arrays
+        a.zero(target)
+        for term in self._outer:
+            self.launch(term.name, term.elements, matrix=0, press=0, force=a[target])
+
+    def _add_powers(self) -> None:
+        """The power of outer forces and of moving pins, at the end of a step."""
+        a = self.arrays
+        a.zero("power")
+        if self._outer:
+            # the forces go where the solver works
+            self._add_outer_forces("q_x")
+            self.launch("add_power", "nodes", force=a["q_x"])
         if "pin_motion" in a and not self.held:
             self.launch("add_pin_power", "pins", step_duration=self.step_size)
-        self.launch("close_step", 1)

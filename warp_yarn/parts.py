@@ -59,6 +59,8 @@ class Parts:
             The smallest part, in steps; 0 where one could not be made, and ``status`` says why.
         """
         done, smallest = 0.0, 1.0
+        # what a rejected part has put by is put back, but an account that it opened
+        self._graphs.run("open", self.model.open_step)
         least = SMALLEST if self.allowed is None else SMALLEST_CONTROLLED
         while done < 1.0:
             left = 1.0 - done
@@ -67,15 +69,10 @@ class Parts:
             size = self.tried = left / parts
             self._copy("kept_", "")
             accepted = not gained and self._try(self.method, count, size, left)
-            if not accepted and self._make_fallback is not None and self._status() != INACCURATE:
-                if gained or self._status() == GAINED or self.size < least:
-                    gained = False
-                    self._restore()
-                    self._fallback = self._fallback or self._make_fallback()
-                    self.model.arrays.put("damps", 1)
-                    accepted = self._try(self._fallback, count, size, left)
-                    self.model.arrays.put("damps", 0)
-                    self.damped += accepted
+            if not accepted and self._is_to_damp(gained, least):
+                gained = False
+                self._restore()
+                accepted = self._damp(count, size, left)
             if not accepted:
                 self.rejected += 1
                 if self.size < least:
@@ -92,7 +89,25 @@ class Parts:
         count()
         method.set_times(size * self.model.step_size, left * self.model.step_size)
         method.advance()
-        return self._accepts(method, size)
+        if method is self.method:
+            return self._accepts(size)
+        self.size = size if self._status() == 0 else 0.5 * size
+        return self._status() == 0
+
+    def _is_to_damp(self, gained: bool, least: float) -> bool:
+        """Whether the fallback is to make the part: it gains energy, or could not be made and is the smallest."""
+        if not self.can_damp or self._status() == INACCURATE:
+            return False
+        return gained or self._status() == GAINED or self.size < least
+
+    def _damp(self, count: Callable[[], None], size: float, left: float) -> bool:
+        """Makes a part by the fallback; whether it is good."""
+        self._fallback = self._fallback or self._make_fallback()
+        self.model.arrays.put("damps", 1)
+        accepted = self._try(self._fallback, count, size, left)
+        self.model.arrays.put("damps", 0)
+        self.damped += accepted
+        return accepted
 
     @property
     def can_damp(self) -> bool:
@@ -107,13 +122,12 @@ class Parts:
         self.model.arrays.zero("status")
         self._copy("", "kept_")
 
-    def _accepts(self, method: Any, size: float) -> bool:
+    def _accepts(self, size: float) -> bool:
         """Whether the part is good; says what size the next is to have."""
         if self._status():
             self.size = 0.5 * size
             return False
-        if self.allowed is None or method is not self.method:
-            self.size = size
+        if self.allowed is None:
             return True
         ratio = self.error() / self.allowed
         factor = MOST_GROWTH if ratio == 0.0 else SAFETY * ratio ** (-1.0 / (self.method.order + 1))

@@ -11,6 +11,7 @@ from .arrays import STATE_TYPES
 from .errors import InputError, SimulationError, choice, number, whole
 from .integrators import INTEGRATORS
 from .kernels import step
+from .kernels.ledger import GAIN
 from .model import Model
 from .parts import Parts
 from .scene import Scene
@@ -33,14 +34,14 @@ class Simulator:
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
         preconditioner: of the conjugate gradient: "multilevel" (``kernels/multilevel.py``), "incomplete"
-            (``kernels/incomplete.py``) or "jacobi" (``kernels/solver.py``); None: "multilevel" where yarns are stiff for
-            their mass and the step, k_s h²/(m L) > 2e4, else "incomplete".
-        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to its start, which is the present velocities or 0, P
-            the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit stages
-            it is that of the adjoint's solves alone.
+            (``kernels/incomplete.py``) or "jacobi" (``kernels/solver.py``); None: "multilevel" where yarns are stiff
+            for their mass and the step, k_s h²/(m L) > 2e4, else "incomplete".
+        tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to its start, which is the present velocities or 0,
+            P the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit
+            stages it is that of the adjoint's solves alone.
         newton_tolerance: of an implicit stage: what is left of the velocities to find, relative to their change in the
-            step, as √ of kinetic energies (``decide`` in ``kernels/stage.py``); None: 1e-3 (less where the step resolves
-            the yarns' stretching, as its square), and 1e-8 where differentiable.
+            step, as √ of kinetic energies (``decide`` in ``kernels/stage.py``); None: 1e-3 (less where the step
+            resolves the yarns' stretching, as its square), and 1e-8 where differentiable.
         max_iterations: of the conjugate gradient; None: as many as there are degrees of freedom, and 1000 at least.
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
             are free. They pay on large cloths (``benchmarks/bandwidth.py``).
@@ -103,6 +104,8 @@ class Simulator:
         fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](self.model)
         allowed = self.step_error and self.step_error * scene.cloth.spacing
         self.parts = Parts(self.model, self.integrator, allowed, fallback)
+        if fallback is not None and not differentiable:
+            self.arrays.put("gain", GAIN)
         self.steps_done = 0
         self.split_steps: dict[int, float] = {}
         self.damped_steps: set[int] = set()

@@ -337,6 +337,7 @@ class Rollout:
             else:
                 self._restart(kept, first)
                 simulator.steps_done = steps_done + first
+                simulator.model.forget_energy()
                 simulator.run_chunk(steps)
             self._set_losses(losses, first, steps)
             adjoint.backward_chunk(first, steps, steps_done)
