@@ -153,7 +153,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 bounds[4] = elastic_energy[0]
                 alert[0] = wp.max(alert[0] - 1, 0)
                 steps_to_audit[0] = steps_to_audit[0] - 1
-                audit_due[0] = wp.where(steps_to_audit[0] <= 0, 1, 0)
+                # what was dissipated is not to be gained again
+                dissipated = inner < scalar(0.5) * bounds[2]
+                audit_due[0] = wp.where(steps_to_audit[0] <= 0 or dissipated, 1, 0)
 
     return SimpleNamespace(
         audit=audit,
