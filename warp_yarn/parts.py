@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .arrays import STATE_TYPES
+from .exclusive import ALONE
 from .kernels.step import INACCURATE
 from .model import Graphs, Model
 
@@ -37,9 +38,13 @@ class Parts:
 
     def __init__(self, model: Model, method: Any, allowed: float | None):
         self.model, self.method, self.allowed = model, method, allowed
+        self.reset()
+        self._graphs = Graphs(model.device)
+
+    def reset(self) -> None:
+        """Begins anew, as for another motion."""
         self.size = self.tried = 1.0
         self.made = self.rejected = 0
-        self._graphs = Graphs(model.device)
 
     def make(self, count: Callable[[], None]) -> float:
         """Makes a step from the present state.
@@ -65,7 +70,7 @@ class Parts:
                 self.rejected += 1
                 if self.size < least:
                     return 0.0
-                self.model.arrays.zero("status")
+                self.model.arrays.put("status", 0, 0, 0)
                 self._copy("", "kept_")
                 continue
             self.made += 1
@@ -95,7 +100,8 @@ class Parts:
         """The state, put by or brought back."""
         model, a = self.model, self.model.arrays
         moving = [name for name in STATE_TYPES if a[name] is not None]
-        if "kept_position" not in a:
-            for name in moving:
-                a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)
+        for name in moving:
+            if f"kept_{name}" not in a:
+                with ALONE:
+                    a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)
         self._graphs.run(target, lambda: model.copy(**{target + name: source + name for name in moving}))
