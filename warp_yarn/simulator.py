@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import os
+import sys
 import threading
 import warnings
 from collections.abc import Callable
@@ -107,7 +108,8 @@ class Simulator:
         state: the present state, as a copy; set it to start from another one. ``steps_done`` stays as it is then.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up; set it where a
             state is one that was saved after so many steps.
-        trajectory: the frames of the last run, where an exception ended it; else None.
+        trajectory: the frames of the last run, where an exception ended it, as long as the state is the last of them;
+            else None.
         split_steps: which of the steps since the beginning could only be made in parts, and the smallest of these [s].
         parts: what makes steps in parts; counts those that it made and rejected.
         arrays: the scene's arrays on the device, by the names that kernels use.
@@ -258,9 +260,12 @@ class Simulator:
     @property
     @_alone
     def trajectory(self) -> Trajectory | None:
-        """The frames of the last run where an exception ended it, the one that it started from first; else None."""
+        """The frames of the last run where an exception ended it, the one that it started from first; None where none
+        did, or where the state is no longer the last of them."""
         recording = self._recording
-        return None if recording is None else recording.trajectory.cut(recording.filled)
+        if recording is None or not recording.open or recording.last != self._steps_done:
+            return None
+        return recording.trajectory.cut(recording.filled)
 
     # -- after exceptions --------------------------------------------------------------------------------------------
 
@@ -295,8 +300,8 @@ class Simulator:
         """How many steps of the chunk are whole."""
         if self._step_in_parts is not None:
             return self._step_in_parts.frame
-        counted, status = (int(self.arrays[name].numpy()[k]) for name, k in (("counters", 0), ("status", 0)))
-        return int(self.arrays["status"].numpy()[2]) - 1 if status else counted
+        failed = int(self.arrays["status"].numpy()[2])
+        return failed - 1 if failed else int(self.arrays["counters"].numpy()[0])
 
     def _close_chunk(self, made: int) -> None:
         """Ends a chunk after so many whole steps, and keeps its frames if a run asks for them."""
@@ -320,7 +325,7 @@ class Simulator:
 
     def _keep_frames(self, base: int, made: int) -> None:
         recording = self._recording
-        if recording is not None and recording.open and base == recording.first + recording.filled - 1:
+        if recording is not None and recording.open and base == recording.last:
             at = base - recording.first
             if at + made < len(recording.trajectory):
                 self._copy_frames(recording.trajectory, at, made + 1)
@@ -439,10 +444,11 @@ class Simulator:
                     asked = min(self.chunk, steps - done)
                     made = self.run_chunk(asked)
                     done += made
-                    bar.update(made)
+                    if bar is not None:
+                        bar.set_description("simulating", refresh=False)
+                        bar.update(made)
                     if made < asked:
                         self.fail(done + 1, trajectory.cut(done + 1))
-                    bar.set_description("simulating", refresh=False)
             self._recording = None
         return trajectory
 
@@ -594,17 +600,21 @@ class Simulator:
             weights: factors of M, D and H in its matrix; None: 1, h and h².
         """
         h = self.step_size
-        with _Visit(self, state):
+        with _Visit(self, state, ahead=True):
             self.arrays.put("weights", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return gather(self.model)
 
 
 class _Visit:
-    """Another state for as long as a block lasts; the arrays that a step works with are free for it."""
+    """Another state for as long as a block lasts; the arrays that a step works with are free for it.
 
-    def __init__(self, simulator: Simulator, state: State | None):
+    Pins and applied forces are those of the last step, or, if asked for, of the next one.
+    """
+
+    def __init__(self, simulator: Simulator, state: State | None, *, ahead: bool = False):
         self.simulator = simulator
+        self.row = simulator._steps_done if ahead else max(0, simulator._steps_done - 1)
         self.visited = None if state is None else _checked(state, simulator.scene.cloth.nodes)
 
     def __enter__(self) -> None:
@@ -619,6 +629,8 @@ class _Visit:
             simulator.integrator.set_times(simulator.step_size, simulator.step_size)
 
         simulator._owed = go_home
+        simulator.arrays.put("counters", 0, self.row)
+        simulator.model.take_inputs()
         if self.visited is not None:
             simulator._upload(self.visited)
 
@@ -640,6 +652,11 @@ class _Recording:
     first: int
     filled: int = 1
     open: bool = True
+
+    @property
+    def last(self) -> int:
+        """Steps done at its last frame."""
+        return self.first + self.filled - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -697,6 +714,8 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _bar(steps: int, progress: bool | None) -> tqdm.tqdm:
-    disable = None if progress is None else not progress
-    return tqdm.tqdm(total=steps, disable=disable, unit="step", leave=False, desc="starting")
+def _bar(steps: int, progress: bool | None) -> contextlib.AbstractContextManager[tqdm.tqdm | None]:
+    """A progress bar where one is wanted. Elsewhere there is none at all: tqdm's lock does not survive Ctrl-C."""
+    if progress is None:
+        progress = sys.stderr is not None and sys.stderr.isatty()
+    return tqdm.tqdm(total=steps, unit="step", leave=False, desc="starting") if progress else contextlib.nullcontext()

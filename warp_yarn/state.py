@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .cloth import Cloth, Yarn
+from .cloth import CLOTH_NUMBERS, Cloth, Yarn
 from .errors import InputError, finite_array
 from .files import whole_file
 from .weave import Weave
@@ -130,16 +130,3 @@ class Trajectory:
             shape = (len(result), cloth.nodes, getattr(result, name).shape[-1])
             finite_array(f"{Path(path)}: {name}", getattr(result, name), shape)
         return result
-
-
-CLOTH_NUMBERS = (
-    "spacing",
-    "radius",
-    "shear",
-    "friction",
-    "friction_stiffness",
-    "friction_damping",
-    "friction_sharpness",
-    "parallel_stiffness",
-)
-"""The cloth's own numbers, as its arguments and the kernels' arrays name them."""
