@@ -5,7 +5,7 @@ from types import ModuleType
 
 from . import paper
 from .cloth import Cloth, Yarn
-from .errors import GradientError, InputError, SimulationError, WarpYarnError
+from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
 from .published import Published, read_published
 from .render import write_mp4, write_png
 from .scene import Scene, Wind
@@ -44,4 +44,4 @@ def __getattr__(name: str) -> ModuleType:
     try:
         return importlib.import_module(".torch", __name__)
     except ModuleNotFoundError as error:
-        raise InputError("gradients need torch: pip install warp_yarn[torch]") from error
+        raise NoAttributeError("gradients need torch: pip install warp_yarn[torch]") from error

@@ -63,7 +63,7 @@ def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.nda
             raise TypeError(f"of type {given.dtype}")
         array = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be an array of real numbers, got {value!r}") from error
+        raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
     wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         raise InputError(f"{name} has shape {array.shape}, must be {wanted}")

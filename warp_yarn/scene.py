@@ -132,7 +132,7 @@ class Scene(Fixed):
             try:
                 steps = np.ndim(value) == 2
             except ValueError as error:  # ragged
-                raise InputError(f"{name} must be an array of real numbers, got {value!r}") from error
+                raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
             result[node] = finite_array(name, value, (None, 3) if steps else (3,))
             result[node].setflags(write=False)
         return result

@@ -469,7 +469,7 @@ class Simulator:
             first = getattr(present, name)
             values[name] = np.empty((frames, *first.shape))
             values[name][: 1 if self.moves(name) else frames] = first
-        return Trajectory(self.scene.cloth, self.step_size, **values)
+        return Trajectory(self.scene.cloth, self.step_size, **values, scene=self.scene, start=start)
 
     def _copy_frames(self, trajectory: Trajectory, at: int, count: int) -> None:
         """Copies the first frames of the chunk on the device to where they belong."""
