@@ -74,9 +74,10 @@ def read_number(name: str, text: str, **allowed: float) -> float:
         InputError: it is none, or out of its range (as of ``errors.number``).
     """
     try:
-        return number(name, float(text), **allowed)
-    except ValueError as error:
-        raise error if isinstance(error, wy.InputError) else wy.InputError(f"{name} = {text!r}, must be a number")
+        value: Any = float(text)
+    except ValueError:
+        value = text  # and number() says so
+    return number(name, value, **allowed)
 
 
 def file_ending(*endings: str) -> Callable[[str], Path]:

@@ -71,6 +71,7 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
 
 
 def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, capsys):
+    monkeypatch.setattr("warp_yarn.simulator.CHUNK_BYTES", 0)  # a step at a time
     run = wy.Simulator.run_chunk
 
     def storm(simulator, steps):
@@ -95,6 +96,7 @@ def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, caps
 
 
 def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
+    monkeypatch.setattr("warp_yarn.simulator.CHUNK_BYTES", 0)  # a step at a time
     run, calls = wy.Simulator.run_chunk, []
 
     def interrupted(simulator, steps):
