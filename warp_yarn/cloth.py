@@ -206,6 +206,8 @@ class Cloth(Fixed):
     def node(self, row: int, column: int) -> int:
         """Index of a node; negative rows and columns count from the end."""
         rows, columns = self.weave.rows, self.weave.columns
+        if not (isinstance(row, int | np.integer) and isinstance(column, int | np.integer)):
+            raise InputError(f"node (row {row!r}, column {column!r}), must be two whole numbers")
         if not -rows <= row < rows or not -columns <= column < columns:
             raise InputError(f"node (row {row}, column {column}) is outside a cloth of {rows} × {columns}")
         return int(column % columns + (row % rows) * columns)

@@ -110,7 +110,10 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
 
 def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:
     """value as an int32 array of distinct indices below count, or an InputError."""
-    array = np.atleast_1d(np.asarray(value))
+    try:
+        array = np.atleast_1d(np.asarray(value))
+    except ValueError:  # ragged
+        array = np.empty((1, 1))
     if array.size == 0:
         return np.zeros(0, dtype=np.int32)
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):

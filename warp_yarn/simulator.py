@@ -157,7 +157,7 @@ class Simulator:
         }
         self.lock = threading.RLock()
         """Held while one thread uses the simulator; before ``exclusive.ALONE`` where both are."""
-        with ALONE:
+        with ALONE, compiling():
             self.model = Model(
                 scene,
                 step=step,
