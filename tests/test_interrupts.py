@@ -21,6 +21,9 @@ from warp_yarn import exclusive
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.state import FIELDS
 
+# of an exception raised in a __del__, which Python reports and drops
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
 STEPS = 6
 CLOTH = wy.paper.cloth("plain", 4, 4)
 TOP = CLOTH.corners("top")

@@ -46,8 +46,11 @@ def check_writable(path: str | os.PathLike) -> None:
         raise InputError(f"{path}: the folder {target.parent} does not exist, make it first")
     if target.is_dir():
         raise InputError(f"{path}: is a folder, must be a file")
-    with tempfile.TemporaryFile(dir=target.parent):
-        pass
+    try:
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise OSError(f"{path}: nothing can be written into its folder ({error})") from error
 
 
 @contextlib.contextmanager

@@ -73,9 +73,9 @@ def writing(path: str | os.PathLike) -> Iterator[None]:
 
 def reload(path: str | os.PathLike) -> None:
     """Makes USD read a file again, where this process has it open: it keeps layers by their paths."""
-    for name in {str(path), os.path.abspath(path), os.path.realpath(path)}:
-        layer = Sdf.Layer.Find(name)
-        if layer:
+    real = os.path.realpath(path)
+    for layer in Sdf.Layer.GetLoadedLayers():
+        if layer.realPath and os.path.realpath(layer.realPath) == real:
             layer.Reload(force=True)
 
 
