@@ -167,6 +167,26 @@ def test_steps_in_parts_are_interrupted_anywhere():
         assert sim.split_steps == split
 
 
+def test_a_team_is_interrupted_anywhere():
+    """Its helpers end, and others take their place."""
+    wide = wy.paper.hung_cloth("plain", 3, 16)
+    sim = wy.Simulator(wide, threads=2)
+    whole = sim.run(3)
+    sim.reset()
+    with interrupted_at(0) as seen:
+        sim.run(3)
+    for place in np.linspace(1, seen[0], 30).astype(int):
+        sim.reset()
+        try:
+            with interrupted_at(int(place)):
+                sim.run(3)
+        except _Stop:
+            check_goes_on(sim, whole)
+        assert threading.active_count() < 20
+    sim.reset()
+    assert threading.active_count() < 6 and same(sim.run(3), whole)
+
+
 @pytest.mark.parametrize("call", ["state", "energy", "forces", "contact", "system", "reset", "deepcopy"])
 def test_other_calls_are_interrupted_anywhere(call):
     """A state is the old one or the new one; what only looks leaves no trace."""

@@ -18,7 +18,7 @@ import warp as wp
 
 from .arrays import STATE_TYPES, YARN_PARAMETERS
 from .errors import InputError, SimulationError, choice, number, whole
-from .exclusive import ALONE, compiling, refuse_recording
+from .exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from .integrators import INTEGRATORS
 from .kernels import step
 from .model import Graphs, Model
@@ -185,6 +185,8 @@ class Simulator:
             self._chunk: int | None = None
             """Steps done when the chunk began that is being made, and None where none is: frames on the device."""
             self._step_in_parts: _StepInParts | None = None
+            self._team = contextlib.ExitStack()
+            """Ends the helpers of a chunk."""
             self._owed: Callable[[], None] | None = None
             """Puts the device into the state that it ought to have; None: it has it."""
             self._recording: _Recording | None = None
@@ -291,6 +293,7 @@ class Simulator:
     def _settle(self) -> None:
         """Finishes or takes back what an exception left half done. It may come again meanwhile: then this begins
         anew."""
+        self._end_team()
         if self._chunk is not None:
             self._close_chunk(self._frames_made())
         if self._owed is not None:
@@ -365,31 +368,41 @@ class Simulator:
         Returns:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
-        with self.lock, contextlib.ExitStack() as stack:
-            with ALONE, compiling():
-                refuse_recording(self.model.device)
-                self._settle()
-                if self.model.strips > 1:
-                    stack.enter_context(self.model.team())
-            base = self._steps_done
-            if base + steps > LARGEST:
-                raise InputError(f"steps = {steps} after {base}, must end at step {LARGEST} at most")
-            self.arrays.put("status", 0, 0, 0)
-            self._count(0)
-            self._graphs.run("record", lambda: self.model.launch("record", "nodes"))
-            self._chunk = base
-            made = 0
-            while made < steps:
-                if self.step_error is None:
-                    made += self._advance(steps - made)
-                if made < steps and not self._make_in_parts(made):
-                    self._close_chunk(made)
-                    return made
-                made = min(made + 1, steps)
-            self._keep_frames(base, made)
-            self._steps_done = base + made
-            self._chunk = None
+        with self.lock:
+            try:
+                with ALONE, compiling():
+                    refuse_recording(self.model.device)
+                    self._settle()
+                    if self.model.strips > 1:
+                        uninterrupted(lambda: self._team.enter_context(self.model.team()))
+                return self._make_chunk(steps)
+            finally:
+                self._end_team()
+
+    def _make_chunk(self, steps: int) -> int:
+        base = self._steps_done
+        if base + steps > LARGEST:
+            raise InputError(f"steps = {steps} after {base}, must end at step {LARGEST} at most")
+        self.arrays.put("status", 0, 0, 0)
+        self._count(0)
+        self._graphs.run("record", lambda: self.model.launch("record", "nodes"))
+        self._chunk = base
+        made = 0
+        while made < steps:
+            if self.step_error is None:
+                made += self._advance(steps - made)
+            if made < steps and not self._make_in_parts(made):
+                self._close_chunk(made)
+                return made
+            made = min(made + 1, steps)
+        self._keep_frames(base, made)
+        self._steps_done = base + made
+        self._chunk = None
         return made
+
+    def _end_team(self) -> None:
+        if self.model.strips > 1:
+            uninterrupted(self._team.close)
 
     def _count(self, frame: int) -> None:
         """Tells the device which frame of the chunk the present state is."""
