@@ -82,9 +82,9 @@ class Scene(Fixed):
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
-        self.forces = self._checked_forces(forces)
-        self.force_nodes = indices("forces", list(self.forces), cloth.nodes, "node")
-        self.force_path = self._force_path(self.forces)
+        checked = self._checked_forces(forces)
+        self.force_nodes = indices("forces", list(checked), cloth.nodes, "node")
+        self.force_path = self._force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
         self.terms = self._terms(terms)
@@ -95,7 +95,7 @@ class Scene(Fixed):
             pins=self.pins,
             pin_stiffness=self.pin_stiffness,
             pin_path=self.pin_path,
-            forces=self.forces,
+            forces=checked,
             sliding=self.sliding,
             terms=None if terms is None else self.terms,
             published_scaling=self.published_scaling,
@@ -103,6 +103,15 @@ class Scene(Fixed):
 
     def __repr__(self) -> str:
         return f"Scene({self.cloth}, terms {', '.join(self.terms)}, sliding {self.sliding})"
+
+    @property
+    def forces(self) -> dict[int, np.ndarray]:
+        """Forces on nodes [N]: {node: 3 numbers, or steps × 3}, the argument that would give these."""
+        result = {}
+        for k, node in enumerate(self.force_nodes.tolist()):
+            path = self.force_path[:, k]
+            result[node] = path[-1] if (path == path[-1]).all() else path[:-1]
+        return result
 
     def same_as(self, other: Scene) -> bool:
         """Whether another one asks for the same motion."""
