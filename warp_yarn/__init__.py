@@ -44,4 +44,7 @@ def __getattr__(name: str) -> ModuleType:
     try:
         return importlib.import_module(".torch", __name__)
     except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        # what hasattr and getattr with a default take for an answer
         raise NoAttributeError("gradients need torch: pip install warp_yarn[torch]") from error
