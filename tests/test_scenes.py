@@ -80,6 +80,18 @@ def test_a_resumed_run_goes_on_in_the_same_scene(usd, tmp_path, options):
     assert both == whole and both.scene.same_as(whole.scene)
 
 
+def test_learning_takes_the_scene_of_the_recording(usd, tmp_path):
+    learn, record = load("scenes/learn.py"), str(tmp_path / "first.npz")
+    arguments = ["--size", "3", "--locked", "--wind", "0", "1", "0", "--steps", "1", "--output", str(usd)]
+    made = hang.main([*arguments, "--record", record])
+    assert learn.read(learn.parser().parse_args([record]))[0].same_as(made.scene)
+    with pytest.raises(wy.InputError, match="--wind does not go with"):
+        learn.read(learn.parser().parse_args([record, "--wind", "0", "1", "0"]))
+    dataclasses.replace(made, scene=None).save(record)
+    old, _ = learn.read(learn.parser().parse_args([record, "--wind", "0", "2", "0"]))
+    assert old.wind.velocity == (0.0, 2.0, 0.0) and old.sliding
+
+
 def test_a_recording_without_a_scene_is_not_resumed(usd, tmp_path, capsys):
     record = tmp_path / "old.npz"
     made = hang.main(["--size", "3", "--steps", "1", "--output", str(usd)])
