@@ -5,18 +5,17 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import tqdm
 import warp as wp
 
 import warp_yarn as wy
 from warp_yarn.errors import number, whole
-from warp_yarn.state import FIELDS
+from warp_yarn.files import check_writable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,12 +24,12 @@ class Run:
 
     Args:
         trajectory: every frame that was finished, the first one the state it started from.
-        seconds: wall time of each step.
+        seconds: wall time, with what had to be compiled.
         stop: what ended it early, to be raised once the frames are written; None: it was not.
     """
 
     trajectory: wy.Trajectory
-    seconds: list[float]
+    seconds: float
     stop: BaseException | None
 
     def end(self) -> None:
@@ -39,35 +38,46 @@ class Run:
             raise self.stop
 
 
-def simulate(
-    simulator: wy.Simulator, steps: int, *, watch: Callable[[int, wy.State], None] = lambda step, state: None
-) -> Run:
-    """Makes steps under a progress bar, one by one: Ctrl-C or a step that fails leaves every frame before it.
-
-    Args:
-        watch: called after each step with its number, from 1, and the state.
-    """
-    steps = whole("steps", steps, least=1)
-    states, seconds, stop = [simulator.state], [], None
-
-    def made() -> wy.Trajectory:
-        frames = (np.stack([getattr(state, name) for state in states]) for name in FIELDS)
-        return wy.Trajectory(simulator.scene.cloth, simulator.step_size, *frames)
-
+def simulate(simulator: wy.Simulator, steps: int) -> Run:
+    """Makes steps under a progress bar: Ctrl-C or a step that fails leaves every frame before it."""
+    steps, begin, stop = whole("steps", steps, least=1), time.perf_counter(), None
     try:
-        # The first step compiles the kernels where they changed, which takes many seconds, and says so meanwhile.
-        with tqdm.trange(1, steps + 1, unit="step", desc="compiling", disable=None) as bar:
-            for k in bar:
-                start = time.perf_counter()
-                if simulator.run_chunk(1) == 0:
-                    simulator.fail(k, made())
-                seconds.append(time.perf_counter() - start)
-                states.append(simulator.state)
-                watch(k, states[-1])
-                bar.set_description("simulating", refresh=False)
+        trajectory = simulator.run(steps, progress=None)
     except (wy.SimulationError, KeyboardInterrupt) as error:
-        stop = error
-    return Run(made(), seconds, stop)
+        trajectory, stop = simulator.trajectory or simulator.run(0), error
+    return Run(trajectory, time.perf_counter() - begin, stop)
+
+
+def write_all(trajectory: wy.Trajectory, *writers: Callable[[], None]) -> None:
+    """Calls what writes files, each even if another failed; then nothing that was simulated is lost.
+
+    Raises:
+        OSError: the first failure, after the frames were saved where temporary files go.
+    """
+    failures = []
+    for write in writers:
+        try:
+            write()
+        except OSError as error:
+            failures.append(error)
+    if failures:
+        rescue = Path(tempfile.mkdtemp(prefix="warp_yarn-")) / "frames.npz"
+        trajectory.save(rescue)
+        print(f"All frames are kept in {rescue}, for --resume and Trajectory.load.", file=sys.stderr)
+        raise failures[0]
+
+
+def read_number(name: str, text: str, **allowed: float) -> float:
+    """A number that was typed.
+
+    Raises:
+        InputError: it is none, or out of its range (as of ``errors.number``).
+    """
+    try:
+        value: Any = float(text)
+    except ValueError:
+        value = text  # and number() says so
+    return number(name, value, **allowed)
 
 
 def file_ending(*endings: str) -> Callable[[str], Path]:
@@ -85,17 +95,22 @@ def add_slowdown(parser: argparse.ArgumentParser) -> None:
     """The option --slowdown of what is written to be played."""
 
     def positive(text: str) -> float:
-        return number("--slowdown", text, above=0.0)
+        return read_number("--slowdown", text, above=0.0)
 
     text = "seconds of playing time for one of simulated time, in files (%(default)g)"
     parser.add_argument("--slowdown", type=positive, default=20.0, metavar="FACTOR", help=text)
 
 
 def make_folders(paths: Sequence[Path | None]) -> None:
-    """The folders of output files, those that are given."""
+    """Makes the folders of output files, those that are given, and finds out now whether they can be written.
+
+    Raises:
+        OSError: they cannot.
+    """
     for path in paths:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(path)
 
 
 def command(main: Callable[[Sequence[str] | None], Any], arguments: Sequence[str] | None = None) -> int:
@@ -104,6 +119,9 @@ def command(main: Callable[[Sequence[str] | None], Any], arguments: Sequence[str
     Returns:
         Exit code: 0; 1 a simulation failed, or its gradient; 2 wrong arguments or files; 130 Ctrl-C.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # what a terminal cannot show becomes a question mark
+            stream.reconfigure(errors="replace")
     wp.config.log_level = wp.LOG_WARNING
     try:
         main(arguments)

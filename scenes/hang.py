@@ -15,14 +15,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from common import Run, add_slowdown, command, file_ending, make_folders, simulate
+from common import Run, add_slowdown, command, file_ending, make_folders, simulate, write_all
 
 import warp_yarn as wy
 from warp_yarn import paper
 from warp_yarn.fabrics import FABRICS
 from warp_yarn.usd import ENDINGS
 
-OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "yarns", "step")
+OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "yarns", "wind", "step", "locked")
 """Options that a recording settles, where one is resumed."""
 
 
@@ -37,10 +37,15 @@ def parser() -> argparse.ArgumentParser:
     add("--columns", type=int, help="number of weft yarns, at least 3")
     add("--weave", choices=wy.WEAVES, help="(plain)")
     add("--yarns", type=int, nargs=2, metavar=("EVEN", "ODD"), help="two of the paper's yarns 1, 2 and 3 (1 2)")
-    add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), default=paper.WIND, help="m/s (0 5 0)")
+    add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m/s (0 5 0)")
     add("--steps", type=int, default=paper.STEPS, help="how many (%(default)s)")
     add("--step", type=float, metavar="SECONDS", help=f"time step ({paper.STEP:g})")
-    add("--locked", action="store_true", help="yarns do not slide along each other: 3 instead of 5 unknowns a node")
+    add(
+        "--locked",
+        action="store_true",
+        default=None,
+        help="yarns do not slide along each other: 3 instead of 5 unknowns a node",
+    )
     add("--output", type=file_ending(*ENDINGS), default=Path("out/hang.usdc"), metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
     add_slowdown(result)
@@ -61,11 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     options = parser().parse_args(arguments)
     make_folders([options.output, options.png, options.mp4, options.record])
     earlier = None if options.resume is None else wy.Trajectory.load(options.resume)
-    cloth, step = chosen(options) if earlier is None else recorded(options, earlier)
-    scene = paper.hung(cloth, wind=wy.Wind(velocity=tuple(options.wind)), sliding=not options.locked)
+    scene, step = chosen(options) if earlier is None else recorded(options, earlier)
     simulator = wy.Simulator(scene, step=step)
     if earlier is not None:
-        simulator.state = earlier[-1]
+        simulator.state, simulator.steps_done = earlier[-1], earlier.steps_done
     run = simulate(simulator, options.steps)
     trajectory = run.trajectory if earlier is None else earlier.joined(run.trajectory)
     write(trajectory, options)
@@ -74,8 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     return trajectory
 
 
-def chosen(options: argparse.Namespace) -> tuple[wy.Cloth, float]:
-    """The cloth and the time step that the options name."""
+def chosen(options: argparse.Namespace) -> tuple[wy.Scene, float]:
+    """The scene and the time step that the options name."""
     size = 17 if options.size is None else options.size
     rows = size if options.rows is None else options.rows
     columns = size if options.columns is None else options.columns
@@ -84,35 +88,38 @@ def chosen(options: argparse.Namespace) -> tuple[wy.Cloth, float]:
     if options.yarns is not None and fabric != "paper":
         raise wy.InputError(f"--yarns = {' '.join(map(str, options.yarns))} are the paper's: not of --fabric {fabric}")
     yarns = {} if options.yarns is None else {"yarns": options.yarns}
-    return FABRICS[fabric](weave=options.weave or "plain", rows=rows, columns=columns, **yarns), step
+    cloth = FABRICS[fabric](weave=options.weave or "plain", rows=rows, columns=columns, **yarns)
+    wind = wy.Wind(velocity=tuple(options.wind or paper.WIND))
+    return paper.hung(cloth, wind=wind, sliding=not options.locked), step
 
 
-def recorded(options: argparse.Namespace, earlier: wy.Trajectory) -> tuple[wy.Cloth, float]:
+def recorded(options: argparse.Namespace, earlier: wy.Trajectory) -> tuple[wy.Scene, float]:
     """Those of the recording."""
     for name in OF_THE_RECORDING:
         if getattr(options, name) is not None:
             raise wy.InputError(f"--{name} does not go with --resume: {options.resume} has its own")
-    return earlier.cloth, earlier.step
+    if earlier.scene is None:
+        raise wy.InputError(f"{options.resume}: has no scene to go on with; it was recorded by an older warp_yarn")
+    return earlier.scene, earlier.step
 
 
 def write(trajectory: wy.Trajectory, options: argparse.Namespace) -> None:
     """The output files, those first that need the least."""
+    writers = [lambda: wy.write_usd(options.output, trajectory, tubes=options.tubes, slowdown=options.slowdown)]
     if options.record is not None:
-        trajectory.save(options.record)
-    wy.write_usd(options.output, trajectory, tubes=options.tubes, slowdown=options.slowdown)
+        writers.insert(0, lambda: trajectory.save(options.record))
     if options.png is not None:
-        wy.write_png(options.png, trajectory)
+        writers.append(lambda: wy.write_png(options.png, trajectory))
     if options.mp4 is not None:
-        wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True)
+        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
+    write_all(trajectory, *writers)
 
 
 def tell(trajectory: wy.Trajectory, run: Run, options: argparse.Namespace) -> None:
     """A few lines about what was made."""
     weave = trajectory.cloth.weave
-    seconds = run.seconds[1:]  # the first step may have compiled
-    cost = f", {1e3 * np.median(seconds):.2f} ms of wall time a step" if seconds else ""
     sliding = np.abs(trajectory.euler - trajectory.cloth.euler).max()
-    print(f"{weave.rows} × {weave.columns} yarns, {weave.name}: {len(trajectory)} frames{cost}")
+    print(f"{weave.rows} × {weave.columns} yarns, {weave.name}: {len(trajectory)} frames, in {run.seconds:.2g} s")
     print(f"lowest point at z = {1e3 * trajectory.position[-1, :, 2].min():.3f} mm in the last frame")
     print(f"largest sliding of a yarn: {1e6 * sliding:.3f} µm")
     files = [options.output, options.record, options.png, options.mp4]

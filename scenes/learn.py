@@ -27,18 +27,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_slowdown, command, file_ending, make_folders
+from common import add_slowdown, command, file_ending, make_folders, read_number
 from matplotlib.figure import Figure
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 import warp_yarn as wy
 from warp_yarn import paper
-from warp_yarn.errors import number, whole
+from warp_yarn.errors import whole
 from warp_yarn.files import whole_file
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.learn import PAPER, Parameter, Result, Task, learn, learnable, split, value_of
 from warp_yarn.state import FIELDS
-from warp_yarn.usd import ENDINGS
+from warp_yarn.usd import ENDINGS, reload, writing
 
 HDF5 = (".h5", ".hdf5")
 
@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     add("--step", type=float, metavar="SECONDS", help="time step of the model to begin with (the time between frames)")
     add("--halvings", type=int, default=3, help="of the step at most, where its error asks for them (%(default)s)")
     add("--integrator", choices=INTEGRATORS, help="method of the model (the simulator's default)")
-    add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of a recording, which has none, m/s (0 5 0)")
+    add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of an old recording without a scene, m/s (0 5 0)")
     add("--iterations", type=int, default=100, help="at most (%(default)s)")
     add("--resolution", type=float, default=1e-9, metavar="METRES", help="of the data, at best (%(default)g)")
     add("--resume", action="store_true", help="go on where the same command was stopped")
@@ -139,7 +139,11 @@ def read(options: argparse.Namespace) -> tuple[wy.Scene, wy.Trajectory]:
         scene, target, first = published.scene, published.trajectory, 1
     else:
         target, first = wy.Trajectory.load(options.file), 0
-        scene = paper.hung(target.cloth, wind=wy.Wind(velocity=tuple(options.wind or paper.WIND)))
+        if target.scene is not None and options.wind is not None:
+            raise wy.InputError(f"--wind does not go with {options.file}, which has its own")
+        scene = target.scene
+        if scene is None:
+            scene = paper.hung(target.cloth, wind=wy.Wind(velocity=tuple(options.wind or paper.WIND)))
     if options.first is None:
         options.first = first
     if options.frames is None and len(target) - 1 - options.first > FRAMES * whole("every", options.every, least=1):
@@ -150,8 +154,8 @@ def read(options: argparse.Namespace) -> tuple[wy.Scene, wy.Trajectory]:
 def chosen(scene: wy.Scene, options: argparse.Namespace) -> list[Parameter]:
     """What to learn: the paper's choice where nothing else is said."""
     known = {p.name: p for p in PAPER}
-    ranges = {name: tuple(number(f"--range {name}", text) for text in ends) for name, *ends in options.range}
-    starts = {name: number(f"--start {name}", text) for name, text in options.start}
+    ranges = {name: tuple(read_number(f"--range {name}", text) for text in ends) for name, *ends in options.range}
+    starts = {name: read_number(f"--start {name}", text) for name, text in options.start}
     counts = learnable(scene)
     own = [name for name in known if counts[split(name)[0]] is None or split(name)[1] < counts[split(name)[0]]]
     names = options.parameters or own
@@ -267,28 +271,35 @@ def animate(path: Path, task: Task, result: Result, target: wy.Trajectory, optio
 def thinned(trajectory: wy.Trajectory, first: int, every: int, step: float) -> wy.Trajectory:
     """Every so many-th frame, from the first on."""
     parts = {name: getattr(trajectory, name)[first::every] for name in FIELDS}
-    return dataclasses.replace(trajectory, step=step, **parts)
+    return dataclasses.replace(trajectory, step=step, scene=None, start=0, **parts)
 
 
 def side_by_side(path: Path, trajectories: dict[str, wy.Trajectory], slowdown: float) -> None:
     """Trajectories as one USD file: /comparison, and below it a name each, next to each other along x."""
-    with tempfile.TemporaryDirectory() as folder, whole_file(path) as temporary:
-        stage = Usd.Stage.CreateNew(str(temporary))
-        layer = stage.GetRootLayer()
-        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/comparison").GetPrim())
-        for k, (name, trajectory) in enumerate(trajectories.items()):
-            part = Path(folder) / f"{name}.usdc"
-            wy.write_usd(part, trajectory, slowdown=slowdown)
-            source = Sdf.Layer.FindOrOpen(str(part))
-            if k == 0:
-                for key in source.pseudoRoot.ListInfoKeys():
-                    if key not in ("defaultPrim", "documentation", "primChildren"):
-                        layer.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
-            Sdf.CopySpec(source, Sdf.Path("/cloth"), layer, Sdf.Path(f"/comparison/{name}"))
-            width = np.ptp(trajectory.cloth.position[:, 0]) + 4.0 * trajectory.cloth.radius
-            place = UsdGeom.Xformable(stage.GetPrimAtPath(f"/comparison/{name}"))
-            place.AddTranslateOp().Set(Gf.Vec3d(1.25 * width * k, 0.0, 0.0))
-        stage.Save()
+    with tempfile.TemporaryDirectory() as folder, whole_file(path) as temporary, writing(path):
+        # as write_usd: no stage may hold the file when it is moved
+        _write_side_by_side(Path(folder), temporary, trajectories, slowdown)
+    reload(path)
+
+
+def _write_side_by_side(folder: Path, path: Path, trajectories: dict[str, wy.Trajectory], slowdown: float) -> None:
+    stage = Usd.Stage.CreateNew(str(path))
+    layer = stage.GetRootLayer()
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/comparison").GetPrim())
+    for k, (name, trajectory) in enumerate(trajectories.items()):
+        part = folder / f"{name}.usdc"
+        wy.write_usd(part, trajectory, slowdown=slowdown)
+        source = Sdf.Layer.FindOrOpen(str(part))
+        if k == 0:
+            for key in source.pseudoRoot.ListInfoKeys():
+                if key not in ("defaultPrim", "documentation", "primChildren"):
+                    layer.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
+        Sdf.CopySpec(source, Sdf.Path("/cloth"), layer, Sdf.Path(f"/comparison/{name}"))
+        width = np.ptp(trajectory.cloth.position[:, 0]) + 4.0 * trajectory.cloth.radius
+        place = UsdGeom.Xformable(stage.GetPrimAtPath(f"/comparison/{name}"))
+        # beside the translation that a cloth far from the origin has
+        place.AddTranslateOp(opSuffix="beside").Set(Gf.Vec3d(1.25 * width * k, 0.0, 0.0))
+    stage.Save()
 
 
 def tell(task: Task, result: Result) -> None:

@@ -16,8 +16,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-import tqdm
-from common import add_slowdown, command, file_ending, make_folders, simulate
+from common import add_slowdown, command, file_ending, make_folders, simulate, write_all
 
 import warp_yarn as wy
 from warp_yarn.usd import ENDINGS
@@ -44,20 +43,16 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, float]:
     simulator = wy.Simulator(published.scene, step=frames.step, integrator="linear")
     simulator.state = frames[1]
     last = len(frames) - 1
+    run = simulate(simulator, last - 1)
     relative = {}
-
-    def watch(step: int, state: wy.State) -> None:
-        frame = step + 1
-        if frame in FRAMES or frame == last:
-            error, displacement = published.distance(state.position, frame)
-            relative[frame] = error / displacement
-            columns = f"{frame:5d} {1e6 * error:11.1f} {1e6 * displacement:18.1f} {100.0 * relative[frame]:8.1f} %"
-            tqdm.tqdm.write(columns)
-
     print("frame  error [µm]  displacement [µm]   relative")
-    run = simulate(simulator, last - 1, watch=watch)
+    for frame, position in enumerate(run.trajectory.position[1:], start=2):
+        if frame in FRAMES or frame == last:
+            error, displacement = published.distance(position, frame)
+            relative[frame] = error / displacement
+            print(f"{frame:5d} {1e6 * error:11.1f} {1e6 * displacement:18.1f} {100.0 * relative[frame]:8.1f} %")
     if options.usd is not None:
-        wy.write_usd(options.usd, run.trajectory, slowdown=options.slowdown)
+        write_all(run.trajectory, lambda: wy.write_usd(options.usd, run.trajectory, slowdown=options.slowdown))
         print("written:", options.usd)
     run.end()
     return relative

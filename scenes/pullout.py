@@ -213,7 +213,7 @@ def write_chart(
 def write_numbers(path: Path, pulls: dict[str, Pull], distance: np.ndarray, exact: np.ndarray) -> None:
     rows = [(name, *row) for name, found in pulls.items() for row in zip(found.distance, found.force, strict=True)]
     rows += [("exact Coulomb friction", *row) for row in zip(distance, exact, strict=True)]
-    with whole_file(path) as temporary, open(temporary, "w", newline="") as file:
+    with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["law", "distance [m]", "force [N]"])
         writer.writerows(rows)

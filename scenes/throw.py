@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 import tqdm
-from common import add_slowdown, command, file_ending, make_folders
+from common import add_slowdown, command, file_ending, make_folders, write_all
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
@@ -288,9 +288,13 @@ def numbers(throw: Throw, found: Search) -> dict[str, Any]:
 def write(throw: Throw, found: Search, result: dict[str, Any], options: argparse.Namespace) -> None:
     """The output files, those first that need the least."""
     with whole_file(options.result) as temporary:
-        temporary.write_text(json.dumps(result, indent=2) + "\n")
-    plot(options.plot, found)
-    wy.write_usd(options.output, throw.trajectory(found.best), slowdown=options.slowdown)
+        temporary.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    trajectory = throw.trajectory(found.best)
+    write_all(
+        trajectory,
+        lambda: plot(options.plot, found),
+        lambda: wy.write_usd(options.output, trajectory, slowdown=options.slowdown),
+    )
 
 
 def plot(path: Path, found: Search) -> None:

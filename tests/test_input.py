@@ -1,6 +1,8 @@
 """Bad input: every refusal names the argument, its value and what is allowed."""
 
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +39,12 @@ def with_nan() -> np.ndarray:
     position = CLOTH.position.copy()
     position[7, 2] = NAN
     return position
+
+
+def run_after(steps: int) -> None:
+    simulator = wy.Simulator(SCENE)
+    simulator.steps_done = steps
+    simulator.run(2)
 
 
 REFUSED: dict[str, tuple[Callable, str]] = {
@@ -84,6 +92,31 @@ REFUSED: dict[str, tuple[Callable, str]] = {
     "state NaN": (lambda: wy.Simulator(SCENE).forces(state(position=with_nan())), r"state\.position\[7, 2\] is nan"),
     "state order": (lambda: wy.Simulator(SCENE).forces(state(euler=swapped())), r"Δs = .* between nodes 5 and 6"),
     "contact": (lambda: wy.Simulator(wy.Scene(CLOTH, terms=["stretch"])).contact(), "no contact"),
+    "text density": (lambda: wy.Yarn(density="0.002", stretch=1.0, bend=1.0), r"density = '0\.002', must be a number"),
+    "huge density": (lambda: wy.Yarn(density=10**400, stretch=1.0, bend=1.0), r"density = 1000.*must be a number"),
+    "complex color": (lambda: wy.Yarn(density=1, stretch=1, bend=1, color=(0, 0, 1j)), "color must be an array"),
+    "one yarn": (lambda: wy.Cloth(PLAIN, yarns=YARN), r"yarns = Yarn\(.*must be a list of at least one Yarn"),
+    "warp number": (lambda: wy.Cloth(PLAIN, yarns=[YARN], warp=0), "warp = 0, must be the materials of 4 yarns"),
+    "weft text": (lambda: wy.Cloth(PLAIN, yarns=[YARN], weft="0000"), "weft = '0000', must be the materials of 4"),
+    "warp lists": (lambda: wy.Cloth(PLAIN, yarns=[YARN], warp=[[0]] * 4), "warp = .*must be a list of whole numbers"),
+    "node text": (lambda: CLOTH.node("0", 0), "node .*row '0'"),
+    "forces array": (lambda: wy.Scene(CLOTH, forces=np.zeros((3, 3))), "(?s)forces = .*must be a dictionary"),
+    "forces text": (lambda: wy.Scene(CLOTH, forces={3: "up"}), r"forces\[3\] .*'up'"),
+    "forces ragged": (lambda: wy.Scene(CLOTH, forces={3: [(0, 0, 1), (0, 1)]}), r"forces\[3\] must be an array"),
+    "forces complex": (lambda: wy.Scene(CLOTH, forces={3: (0, 0, 1j)}), r"forces\[3\] must be an array of numbers"),
+    "forces by text": (lambda: wy.Scene(CLOTH, forces={"3": (0, 0, 1)}), "forces = .*must be a list of whole numbers"),
+    "pins ragged": (lambda: wy.Scene(CLOTH, pins=[[1, 2], [3]]), "pins = .*must be a list of whole numbers"),
+    "terms number": (lambda: wy.Scene(CLOTH, terms=3), "terms = 3, must be a list of names"),
+    "term unhashable": (lambda: wy.Scene(CLOTH, terms=[["stretch"]]), r"terms = \['stretch'\], must be one of"),
+    "state dict": (lambda: setattr(wy.Simulator(SCENE), "state", {}), r"state = \{\}, must be a State"),
+    "state to look at": (lambda: wy.Simulator(SCENE).energy({}), r"state = \{\}, must be a State"),
+    "state text": (lambda: wy.Simulator(SCENE).forces(state(velocity="x")), "state.velocity must be an array"),
+    "steps done": (lambda: setattr(wy.Simulator(SCENE), "steps_done", -1), "steps_done = -1, must be a whole number"),
+    "steps done float": (lambda: setattr(wy.Simulator(SCENE), "steps_done", 1.5), r"steps_done = 1\.5"),
+    "chunk": (lambda: wy.Simulator(SCENE, chunk=10**9), r"chunk = 1000000000, must be a whole number, from 1 to"),
+    "max_iterations": (lambda: wy.Simulator(SCENE, max_iterations=2**31), "max_iterations = 2147483648, .* to 214748"),
+    "frames": (lambda: wy.Simulator(SCENE).run(10**15), "steps = 10{15}, whose frames take .* GiB, more than there is"),
+    "too late": (lambda: run_after(2**31 - 2), "steps = 2 after 2147483646, must end at step 2147483647 at most"),
     "recording": (lambda: wy.Trajectory.load(__file__), "not a recording"),
     "no recording": (lambda: wy.Trajectory.load("nowhere.npz"), "no such file"),
 }  # fmt: skip
@@ -162,3 +195,37 @@ def test_a_solver_that_does_not_converge_stops_the_run() -> None:
     sim = wy.Simulator(scene, integrator="linear", max_iterations=1, tolerance=1e-12)
     with pytest.raises(wy.SimulationError, match=r"stopped after 1 iterations at a residual of .*above its tolerance"):
         sim.run(5)
+
+
+def test_the_largest_numbers_are_taken() -> None:
+    sim = wy.Simulator(SCENE, max_iterations=2**31 - 1)
+    sim.steps_done = 2**31 - 3
+    assert len(sim.run(2)) == 3 and sim.steps_done == 2**31 - 1
+
+
+def test_without_torch_there_is_no_attribute(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "warp_yarn.torch", raising=False)
+    monkeypatch.delattr(wy, "torch", raising=False)
+    assert not hasattr(wy, "torch") and getattr(wy, "torch", 3) == 3
+    with pytest.raises(wy.InputError, match=r"pip install warp_yarn\[torch\]"):
+        _ = wy.torch
+
+
+@pytest.mark.parametrize("when", ["before Warp starts", "later"])
+def test_a_kernel_cache_that_cannot_be_written_is_named(tmp_path, when) -> None:
+    """A file stands where the folder should be: so it is refused to root too."""
+    (tmp_path / "cache").write_text("")
+    code = (
+        "import warp as wp, warp_yarn as wy\n"
+        f"wp.config.quiet = True; {'wp.init()' if when == 'later' else ''}\n"
+        "wp.config.kernel_cache_dir = 'cache/kernels'\n"
+        "sim = None\n"
+        "for call in (lambda: sim.run(1), lambda: sim.energy()):\n"
+        "    try:\n"
+        "        sim = sim or wy.Simulator(wy.paper.hung_cloth('plain', 3, 3)); call()\n"
+        "    except wy.InputError as error: print(error)\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.count("WARP_CACHE_PATH") == 2

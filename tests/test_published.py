@@ -1,5 +1,7 @@
 """Reading the paper's published data, and following it."""
 
+import contextlib
+import subprocess
 import sys
 from pathlib import Path
 
@@ -203,6 +205,28 @@ def test_a_file_of_another_kind_is_an_input_error(tmp_path):
         file["weights"] = np.zeros(3)
     with pytest.raises(wy.InputError, match=r"foreign\.h5: has no dataset 'Properties/Size'"):
         wy.read_published(foreign)
+
+
+def test_a_file_that_another_program_writes_to_is_named(path):
+    code = f"import h5py, sys; file = h5py.File({str(path)!r}, 'a'); print('open', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        with pytest.raises(wy.InputError, match=r"small\.h5: another program has it open"):
+            wy.read_published(path)
+        other.stdin.close()
+    assert len(wy.read_published(path).trajectory) == FRAMES
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bytes_that_were_changed_are_an_input_error_or_do_no_harm(path, seed):
+    random, data = np.random.default_rng(seed), path.read_bytes()
+    for _ in range(40):
+        changed = bytearray(data)
+        for at in random.integers(0, min(len(data), 4000), random.integers(1, 30)):
+            changed[at] = random.integers(256)
+        path.write_bytes(changed)
+        with contextlib.suppress(wy.InputError):
+            wy.read_published(path)
 
 
 def test_without_h5py_the_error_says_what_to_install(path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import ctypes.util
 import os
+import re
 import subprocess
 import sys
 
@@ -64,8 +65,36 @@ def test_each_frame_has_its_own_picture(drawing, tmp_path):
         wy.write_png(tmp_path / "a.png", trajectory, frame=frame, size=SIZE)
         images.append(imageio.imread(tmp_path / "a.png").astype(float))
     assert np.abs(images[0] - images[1]).mean() > 2.0
-    # Noise of the shading in nooks differs from one to the next.
-    assert np.abs(images[2] - images[1]).mean() < 0.5
+    assert np.array_equal(images[2], images[1])
+
+
+@pytest.mark.parametrize("size", [SIZE, (333, 250), (640, 64)])
+def test_the_same_picture_is_the_same(drawing, tmp_path, size):
+    """To the last pixel: drawn again in one window, and in another one after other pictures."""
+    images = []
+    for frame in (0, 1, 0):
+        wy.write_png(tmp_path / "a.png", waving(), frame=frame, size=size)
+        images.append(imageio.imread(tmp_path / "a.png"))
+    assert np.array_equal(images[0], images[2]) and not np.array_equal(images[0], images[1])
+    with render._Picture(waving(frames=1), size, render.VIEW) as picture:
+        assert all(np.array_equal(picture.drawn(0), images[0]) for _ in range(3))
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_a_picture_larger_than_the_machine_draws_is_refused(drawing, tmp_path, upright):
+    """And the largest is not black."""
+    with pytest.raises(wy.InputError, match=r"size = .*, must be at most \d+ pixels wide and high") as error:
+        wy.write_png(tmp_path / "a.png", waving(), size=(16, 100_000) if upright else (100_000, 16))
+    assert os.listdir(tmp_path) == []
+    largest = int(re.search(r"at most (\d+)", str(error.value))[1])
+    if largest > 8000:
+        pytest.skip("takes much memory")
+    wy.write_png(tmp_path / "a.png", waving(), size=(16, largest) if upright else (largest, 16))
+    assert imageio.imread(tmp_path / "a.png")[..., :3].min(axis=-1).max() > 200
+    with pytest.raises(wy.InputError, match="must be at most"):
+        wy.write_png(tmp_path / "a.png", waving(), size=(16, largest + 1) if upright else (largest + 1, 16))
+    with pytest.raises(wy.InputError, match="must be at most"):
+        wy.write_mp4(tmp_path / "a.mp4", waving(), size=(largest + 1, 16))
 
 
 def test_the_upper_yarn_hides_the_lower_one(drawing, tmp_path):

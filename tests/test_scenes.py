@@ -1,9 +1,16 @@
 """scenes/hang.py at 5 × 5, in this process."""
 
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from scripts import exit_code, load, samples
+from scripts import ROOT, exit_code, load, samples
 
 import warp_yarn as wy
 from warp_yarn.state import FIELDS
@@ -73,15 +80,98 @@ def test_a_resumed_run_is_the_uninterrupted_one(usd, tmp_path):
         np.testing.assert_allclose(getattr(both, name), expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("options", [["--wind", "0", "1", "0"], ["--locked"], ["--step", "5e-4", "--weave", "twill"]])
+def test_a_resumed_run_goes_on_in_the_same_scene(usd, tmp_path, options):
+    """Twice: the second recording is of a resumed run."""
+    whole = hang.main(["--size", "5", *options, "--steps", "6", "--output", str(usd)])
+    record = str(tmp_path / "first.npz")
+    hang.main(["--size", "5", *options, "--steps", "2", "--output", str(usd), "--record", record])
+    for _ in range(2):
+        both = hang.main(["--resume", record, "--steps", "2", "--output", str(usd), "--record", record])
+    assert both == whole and both.scene.same_as(whole.scene)
+
+
+def test_learning_takes_the_scene_of_the_recording(usd, tmp_path):
+    learn, record = load("scenes/learn.py"), str(tmp_path / "first.npz")
+    arguments = ["--size", "3", "--locked", "--wind", "0", "1", "0", "--steps", "1", "--output", str(usd)]
+    made = hang.main([*arguments, "--record", record])
+    assert learn.read(learn.parser().parse_args([record]))[0].same_as(made.scene)
+    with pytest.raises(wy.InputError, match="--wind does not go with"):
+        learn.read(learn.parser().parse_args([record, "--wind", "0", "1", "0"]))
+    dataclasses.replace(made, scene=None).save(record)
+    old, _ = learn.read(learn.parser().parse_args([record, "--wind", "0", "2", "0"]))
+    assert old.wind.velocity == (0.0, 2.0, 0.0) and old.sliding
+
+
+def test_a_recording_without_a_scene_is_not_resumed(usd, tmp_path, capsys):
+    record = tmp_path / "old.npz"
+    made = hang.main(["--size", "3", "--steps", "1", "--output", str(usd)])
+    dataclasses.replace(made, scene=None).save(record)
+    assert exit_code(hang, ["--resume", str(record), "--output", str(usd)]) == 2
+    assert "has no scene to go on with" in capsys.readouterr().err
+
+
+def test_a_full_disk_ends_with_code_2_and_keeps_the_frames(usd, tmp_path, capsys, monkeypatch):
+    resource = pytest.importorskip("resource")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    frames = []
+
+    def write(path, trajectory, **options):
+        """To a disk that is full, and then has room again."""
+        frames.append(trajectory)
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+        try:
+            write_usd(path, trajectory, **options)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    write_usd = wy.write_usd
+    monkeypatch.setattr(wy, "write_usd", write)
+    png = tmp_path / "hang.png"
+    arguments = ["--size", "3", "--steps", "4", "--output", str(usd), "--png", str(png)]
+    assert exit_code(hang, arguments) == 2
+    told = capsys.readouterr().err
+    assert "hang.usdc cannot be written" in told and "File too large" in told
+    [kept] = (tmp_path / "temporary").rglob("*.npz")
+    assert str(kept) in told and wy.Trajectory.load(kept) == frames[0] and len(frames[0]) == 5
+    assert png.exists()  # what could be written was
+    assert [path.name for path in usd.parent.iterdir()] == []
+
+
+def test_an_output_folder_that_cannot_be_written_is_found_before_the_run(monkeypatch, capsys):
+    if not Path("/proc/self").is_dir():
+        pytest.skip("needs the files of a Linux")
+    monkeypatch.setattr(wy.Simulator, "run", None)
+    assert exit_code(hang, ["--size", "3", "--output", "/proc/self/hang.usdc"]) == 2
+    assert "/proc/self/hang.usdc: nothing can be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["cp932", "ascii"])
+def test_output_does_not_depend_on_the_terminal(usd, encoding):
+    """Nor does what is written."""
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "LC_ALL": "C"}
+    script = ROOT / "scenes" / "hang.py"
+    arguments = [sys.executable, str(script), "--size", "3", "--steps", "2", "--output", str(usd)]
+    for asked in (arguments, [*arguments[:2], "--help"], [*arguments, "--yarns", "1", "9"]):
+        ran = subprocess.run(asked, capture_output=True, env=environment, timeout=100)
+        assert ran.returncode == (2 if "9" in asked else 0), ran.stderr
+        assert b"UnicodeEncodeError" not in ran.stderr
+    assert samples(usd) == [3, 3]
+
+
 def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
     record = str(tmp_path / "first.npz")
     hang.main(["--size", "5", "--steps", "1", "--output", str(usd), "--record", record])
-    for option in (["--fabric", "paper"], ["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"]):
+    others = (["--fabric", "paper"], ["--wind", "0", "5", "0"], ["--wind", "1", "0", "0"], ["--locked"])
+    for option in (["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"], *others):
         assert exit_code(hang, ["--resume", record, *option]) == 2
         assert option[0] in capsys.readouterr().err
 
 
 def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, capsys):
+    monkeypatch.setattr("warp_yarn.simulator.CHUNK_BYTES", 0)  # a step at a time
     run = wy.Simulator.run_chunk
 
     def storm(simulator, steps):
@@ -106,6 +196,7 @@ def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, caps
 
 
 def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
+    monkeypatch.setattr("warp_yarn.simulator.CHUNK_BYTES", 0)  # a step at a time
     run, calls = wy.Simulator.run_chunk, []
 
     def interrupted(simulator, steps):

@@ -1,6 +1,9 @@
 """The step of eq. 2 against a dense solve, closed forms, conservation and its order."""
 
+import copy
+import dataclasses
 import functools
+import pickle
 
 import numpy as np
 import pytest
@@ -209,3 +212,215 @@ def test_recording_is_read_back(tmp_path) -> None:
     assert np.array_equal(back.cloth.weave.flipped, trajectory.cloth.weave.flipped)
     assert back.cloth.yarns == trajectory.cloth.yarns
     assert back.cloth.shear == trajectory.cloth.shear
+
+
+def moved_scene(**options) -> wy.Scene:
+    """Pins and forces that change from step to step, and nothing by default."""
+    c = cloth(4, 4)
+    top = c.corners("top")
+    path = c.position[top] + 1e-4 * np.sin(0.7 * np.arange(1, 13))[:, None, None]
+    forces = {5: 1e-4 * np.cos(np.arange(30.0)).reshape(10, 3), 6: (1e-5, 0.0, 0.0)}
+    given = {
+        "pins": top,
+        "pin_path": path,
+        "forces": forces,
+        "wind": wy.Wind(velocity=(1, 2, 3), density=1.5, drag=0.2),
+    }
+    return wy.Scene(c, **{**given, **options})
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"gravity": None, "wind": None, "pin_stiffness": None},
+        {"sliding": False, "terms": ["stretch", "gravity", "applied"]},
+        {"pins": [], "pin_path": None, "forces": None, "published_scaling": True},
+    ],
+    ids=["all", "held", "terms", "free"],
+)
+def test_a_recording_goes_on_as_the_run_would_have(tmp_path, options):
+    """In another process: scene, steps done and state are all that there is."""
+    scene = moved_scene(**options)
+    whole = wy.Simulator(scene, step=5e-4).run(8)
+    wy.Simulator(scene, step=5e-4).run(3).save(tmp_path / "first.npz")
+    first = wy.Trajectory.load(tmp_path / "first.npz")
+    assert first.scene.same_as(scene) and first.scene.cloth is first.cloth and first.steps_done == 3
+    sim = wy.Simulator(first.scene, step=first.step)
+    sim.state, sim.steps_done = first[-1], first.steps_done
+    both = first.joined(sim.run(5))
+    assert both == whole and both.start == 0 and both.steps_done == 8
+    # and again, from a recording that does not begin at the beginning
+    sim.run(1).save(tmp_path / "later.npz")
+    assert wy.Trajectory.load(tmp_path / "later.npz").start == 8
+
+
+def test_where_a_path_is_looked_up_is_what_steps_done_says():
+    scene = moved_scene()
+    sim = wy.Simulator(scene)
+    whole = sim.run(6)
+    late = wy.Simulator(scene)
+    late.state = whole[3]
+    assert not np.array_equal(late.run(1).position[1], whole.position[4])  # the pins are elsewhere then
+    late.state, late.steps_done = whole[3], 3
+    assert np.array_equal(late.run(3).position, whole.position[3:])
+    # what forces and systems are of does not depend on the steps that were made before
+    fresh = wy.Simulator(scene)
+    for other in (sim, fresh):
+        other.state, other.steps_done = whole[2], 2
+    assert all(np.array_equal(sim.forces()[name][0], fresh.forces()[name][0]) for name in scene.terms if name != "mass")
+    assert np.array_equal(sim.system().rhs, fresh.system().rhs)
+    moved = scene.pin_path[2] - scene.pin_path[1]
+    system = sim.system().rhs.reshape(-1)[: 3 * scene.cloth.nodes].reshape(-1, 3)[scene.pins]
+    sim.steps_done = 1
+    before = sim.system().rhs.reshape(-1)[: 3 * scene.cloth.nodes].reshape(-1, 3)[scene.pins]
+    # k_h times the way that the target moves in a step, times h
+    assert system - before == pytest.approx(1e4 * moved * sim.step_size, rel=1e-6)
+
+
+def damaged(path, **changes):
+    """The recording with some of its arrays replaced; None: left out."""
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data} | changes
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+
+
+DAMAGES = {
+    "step 0": ({"step": 0.0}, r"step = 0\.0, must be finite and above 0"),
+    "step NaN": ({"step": np.nan}, "step = nan"),
+    "step −1": ({"step": -1.0}, r"step = -1\.0"),
+    "text": ({"position": np.full((4, 16, 3), "1.0")}, "position must be an array of numbers"),
+    "complex": ({"velocity": np.full((4, 16, 3), 1j)}, "velocity must be an array of numbers"),
+    "objects": ({"euler": np.full((4, 16, 2), None)}, "not a recording of warp_yarn"),
+    "shape": ({"euler": np.zeros((4, 16, 3))}, r"euler has shape \(4, 16, 3\), must be \(4, 16, 2\)"),
+    "frames": ({"anchor": np.zeros((3, 16, 2))}, r"anchor has shape \(3, 16, 2\)"),
+    "no frame": ({"position": np.zeros((0, 16, 3))}, "has no frame"),
+    "not finite": ({"position": np.full((4, 16, 3), np.inf)}, r"position\[0, 0, 0\] is inf"),
+    "newer": ({"format": 99}, "format = 99, this warp_yarn reads up to 2"),
+    "start": ({"start": -1}, "start = -1, must be a whole number"),
+    "density": ({"yarns": np.full((2, 3), -1.0)}, r"density = -1\.0"),
+    "missing": ({"draft": None}, "not a recording of warp_yarn"),
+    "wind": ({"scene_wind": np.full(5, np.nan)}, "wind velocity"),
+    "pins": ({"scene_pins": np.array([99])}, "pins names node 99"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_recording_is_refused(tmp_path, damage):
+    changes, message = DAMAGES[damage]
+    path = tmp_path / "run.npz"
+    wy.Simulator(moved_scene()).run(3).save(path)
+    damaged(path, **changes)
+    with pytest.raises(wy.InputError, match=f"run.npz: .*{message}"):
+        wy.Trajectory.load(path)
+
+
+def test_a_recording_of_before_formats_is_read(tmp_path):
+    path = tmp_path / "run.npz"
+    made = wy.Simulator(moved_scene()).run(3)
+    made.save(path)
+    with np.load(path) as data:
+        new = [name for name in data if name.startswith("scene_")] + ["format", "start"]
+    damaged(path, **dict.fromkeys(new))
+    back = wy.Trajectory.load(path)
+    assert back == made and back.scene is None
+
+
+def test_frames_that_do_not_follow_are_not_joined():
+    scene = moved_scene()
+    sim = wy.Simulator(scene)
+    first, later = sim.run(3), sim.run(3)
+    assert len(first.joined(later)) == 7
+    wrong = {
+        r"later\.step = 0\.002": dataclasses.replace(later, step=2e-3),
+        r"later\.cloth is another": dataclasses.replace(later, cloth=scene.cloth.replace(shear=1.0)),
+        r"later\.scene is another": dataclasses.replace(later, scene=scene.replace(gravity=None)),
+        r"later\.start = 0, must be .*, 3": first,
+        r"later\.velocity\[0\] is off": dataclasses.replace(later, velocity=later.velocity + 1e-3),
+        "of 4 and 0 frames": later.cut(0),
+        "must be a Trajectory": None,
+    }
+    for message, other in wrong.items():
+        with pytest.raises(wy.InputError, match=message):
+            first.joined(other)
+
+
+def test_states_compare():
+    sim = wy.Simulator(moved_scene())
+    state = sim.state
+    assert state == sim.state and state == dataclasses.replace(state, anchor=None)
+    assert state != dataclasses.replace(state, velocity=state.velocity + 1e-300) and state != 0
+    made = sim.run(2)
+    sim.reset()
+    assert made == sim.run(2) and made != made.cut(2) and made != 0
+
+
+def test_scenes_and_cloths_do_not_change():
+    """A simulator would not know; so nothing pretends to."""
+    scene = moved_scene()
+    for thing, name, value in (
+        (scene, "wind", None),
+        (scene, "terms", ()),
+        (scene, "new", 1),
+        (scene.cloth, "radius", 1e-4),
+        (scene.cloth, "yarns", ()),
+    ):
+        kind = type(thing).__name__.lower()
+        with pytest.raises(
+            wy.InputError, match=rf"{kind}\.{name} cannot be set.*{kind}\.replace\({name}=\.\.\.\)"
+        ) as error:
+            setattr(thing, name, value)
+        assert isinstance(error.value, AttributeError)
+        with pytest.raises(wy.InputError, match="cannot be deleted"):
+            delattr(thing, "cloth" if thing is scene else "weave")
+    arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_path, scene.forces[5]]
+    arrays += [scene.cloth.position, scene.cloth.warp, scene.cloth.weft]
+    for array in arrays:
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+    for again in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
+        assert again.same_as(scene)
+        with pytest.raises(wy.InputError, match="cannot be set"):
+            again.wind = None
+
+
+def test_replace_makes_what_the_arguments_would_have():
+    scene = moved_scene()
+    assert scene.replace().same_as(scene)
+    calm = scene.replace(wind=None, gravity=(0, 0, -1.0))
+    assert calm.same_as(moved_scene(wind=None, gravity=(0, 0, -1.0))) and "wind" not in calm.terms
+    assert scene.wind is not None and "wind" in scene.terms
+    chosen = scene.replace(terms=["stretch"])
+    assert chosen.replace(gravity=None).terms == ("mass", "stretch")
+    thin = scene.cloth.replace(radius=1e-4)
+    assert (thin.radius, thin.spacing, thin.yarns) == (1e-4, scene.cloth.spacing, scene.cloth.yarns)
+    assert scene.cloth.replace(spacing=2e-3).position[1, 0] == 2e-3  # the pose is upright, whatever the spacing
+    assert np.array_equal(
+        thin.replace(pose=scene.cloth.position + 1.0).replace(shear=1.0).position, thin.position + 1.0
+    )
+    for thing, changes, message in (
+        (scene, {"winds": None}, r"replace\(winds=\.\.\.\): must be one of cloth, gravity"),
+        (scene.cloth, {"radius": 1.0}, "half the spacing"),
+        (chosen, {"terms": ["friction"], "sliding": False}, "do not slide"),
+    ):
+        with pytest.raises(wy.InputError, match=message):
+            thing.replace(**changes)
+
+
+def test_winds_and_yarns_keep_nothing_of_their_callers():
+    speed, scenes = np.zeros(3), []
+    color = np.full(3, 0.5)
+    yarn = wy.Yarn(density=np.full((), 2e-3), stretch=np.float32(5e5), bend=1, color=color)
+    for k in range(3):
+        speed[1] = k
+        scenes.append(wy.Scene(cloth(3, 3), wind=wy.Wind(velocity=speed, density=np.full((), 2.0))))
+    color[:] = 9.0
+    assert [scene.wind.velocity[1] for scene in scenes] == [0.0, 1.0, 2.0]
+    assert yarn.color == (0.5, 0.5, 0.5) and all(type(v) is float for v in (yarn.density, yarn.stretch, yarn.bend))
+
+
+def test_reset_is_the_beginning():
+    sim = wy.Simulator(moved_scene())
+    first = sim.run(4)
+    sim.reset()
+    assert sim.steps_done == 0 and sim.state == first[0] and sim.run(4) == first

@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom, UsdValidation
+from pxr import Sdf, Usd, UsdGeom, UsdValidation
 from waving import BLUE, RED, rotation, waving
 
 import warp_yarn as wy
@@ -340,12 +340,25 @@ def test_a_full_disk_leaves_what_was_there(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, hard))
     try:
-        with pytest.raises(Exception, match="File too large"):
+        with pytest.raises(OSError, match=r"a\.usdc cannot be written: .*File too large"):
             wy.write_usd(path, waving(frames=50))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert os.listdir(tmp_path) == ["a.usdc"]
     assert path.stat().st_size == size
+
+
+def test_no_stage_holds_the_file_when_it_is_moved(tmp_path, monkeypatch):
+    """Windows would not move it."""
+    seen, move = [], os.replace
+
+    def replace(source, target):
+        seen.append(Sdf.Layer.Find(str(source)))
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    wy.write_usd(tmp_path / "a.usdc", waving())
+    assert seen == [None]
 
 
 def test_a_file_is_replaced(tmp_path):
@@ -382,3 +395,63 @@ def test_wrong_trajectories(tmp_path):
     with pytest.raises(wy.InputError, match=r"trajectory.position\[1, 4, 2\] is nan"):
         wy.write_usd(path, trajectory)
     assert os.listdir(tmp_path) == []
+
+
+# -- far from the origin, and again ----------------------------------------------------------------------------------
+
+
+def in_world(shape, frame):
+    """Points in double precision, as USD places them."""
+    matrix = np.array(shape.ComputeLocalToWorldTransform(frame))
+    return points_of(shape, frame) @ matrix[:3, :3] + matrix[3, :3]
+
+
+@pytest.mark.parametrize("offset", [0.5, 1e3, 1e5, -1e7])
+def test_a_cloth_far_away_keeps_its_shape(tmp_path, tubes, offset):
+    """Its points are as near to the right ones as single precision brings a cloth to them that lies at the origin."""
+    near, far = waving(), waving()
+    middle = near.position.mean(axis=(0, 1))
+    near.position -= middle
+    far.position += np.array([offset, 0.0, -offset]) - middle
+    _near, shapes = written(tmp_path / "near.usdc", near, tubes=tubes)
+    _far, moved = written(tmp_path / "far.usdc", far, tubes=tubes)
+    for name, shape in shapes.items():
+        for frame in range(3):
+            expected = in_world(shape, frame) + np.array([offset, 0.0, -offset])
+            # doubles there have their own unit
+            assert np.abs(in_world(moved[name], frame) - expected).max() < SINGLE + 1e-4 * RADIUS + 4e-16 * abs(offset)
+            low, high = np.array(moved[name].GetExtentAttr().Get(frame))
+            points = points_of(moved[name], frame)
+            assert (low <= points.min(axis=0) + SINGLE).all() and (high >= points.max(axis=0) - SINGLE).all()
+
+
+def test_a_cloth_that_moves_far_is_followed(tmp_path, tubes):
+    """From the origin to 100 km away: no one translation is near to all of it."""
+    trajectory, still = waving(), waving()
+    way = np.array([[0.0, 0.0, 0.0], [1e2, 0.0, 0.0], [1e5, 0.0, -1e5]])
+    trajectory.position += way[:, None]
+    _still, shapes = written(tmp_path / "still.usdc", still, tubes=tubes)
+    _stage, moved = written(tmp_path / "a.usdc", trajectory, tubes=tubes)
+    for name, shape in shapes.items():
+        for frame in range(3):
+            expected = in_world(shape, frame) + way[frame]
+            assert np.abs(in_world(moved[name], frame) - expected).max() < SINGLE + 1e-4 * RADIUS + 1e-10
+
+
+def test_a_cloth_that_is_near_has_no_translation(tmp_path):
+    stage, _ = written(tmp_path / "a.usdc", waving())
+    assert not UsdGeom.Xformable(stage.GetPrimAtPath("/cloth")).GetOrderedXformOps()
+
+
+@pytest.mark.parametrize("ending", usd.ENDINGS)
+def test_a_rewritten_file_is_read_anew(tmp_path, monkeypatch, ending):
+    """By stages that have it open, and by those opened later, whatever the path is called."""
+    monkeypatch.chdir(tmp_path)
+    os.symlink(f"a{ending}", f"link{ending}")
+    for k, (first, again) in enumerate([("a", "a"), ("a", "link"), ("link", "a"), (str(tmp_path / "a"), "a")]):
+        wy.write_usd(f"{first}{ending}", waving(frames=2 + k))
+        stage = Usd.Stage.Open(f"{first}{ending}")
+        wy.write_usd(f"{again}{ending}", waving(frames=9 + k))
+        assert Usd.Stage.Open(f"{first}{ending}").GetEndTimeCode() == 8.0 + k
+        assert stage.GetEndTimeCode() == 8.0 + k
+        assert os.path.islink(f"link{ending}")

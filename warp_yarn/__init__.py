@@ -6,7 +6,7 @@ from types import ModuleType
 
 from . import fabrics, paper
 from .cloth import Cloth, Yarn
-from .errors import GradientError, InputError, SimulationError, WarpYarnError
+from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
 from .published import Published, read_published
 from .render import write_mp4, write_png
 from .scene import Scene, Wind
@@ -52,4 +52,4 @@ def __getattr__(name: str) -> ModuleType:
         if error.name != "torch":
             raise
         # what hasattr and getattr with a default take for an answer
-        raise AttributeError("gradients need torch: pip install warp_yarn[torch]") from error
+        raise NoAttributeError("gradients need torch: pip install warp_yarn[torch]") from error

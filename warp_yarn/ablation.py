@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import time
 from typing import Any
@@ -206,24 +205,17 @@ def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> 
 
 def _without(scene: Scene, names: set[str]) -> Scene:
     """The scene without these terms, or sliding."""
-    result = copy.copy(scene)
-    if "sliding" in names:
-        result.sliding = False
+    sliding = scene.sliding and "sliding" not in names
     left = (name for name in scene.terms if name not in names)
-    result.terms = tuple(name for name in left if result.sliding or not TERMS[name].sliding_only)
-    return result
+    return scene.replace(sliding=sliding, terms=[name for name in left if sliding or not TERMS[name].sliding_only])
 
 
 def _halved(scene: Scene, start: State | None) -> Scene:
-    """The scene for half the step: what follows a path by the step stays where it is for two, but for exact pins, which
-    go evenly from one place to the next."""
-    result = copy.copy(scene)
-    if scene.pin_path is not None:
-        result.pin_path = np.repeat(scene.pin_path, 2, axis=0)
-        if scene.pin_stiffness is None:
-            first = (scene.cloth if start is None else start).position[scene.pins]
-            result.pin_path[::2] += np.concatenate([first[None], scene.pin_path[:-1]])
-            result.pin_path[::2] *= 0.5
-    # its last row is what stays
-    result.force_path = np.repeat(scene.force_path, 2, axis=0)[: 2 * len(scene.force_path) - 1]
-    return result
+    """The scene for half the step: pins go evenly to where they are at a step's end, and forces stay for two."""
+    path = scene.pin_path
+    if path is not None:
+        first = (scene.cloth if start is None else start).position[scene.pins]
+        before = np.concatenate([first[None], path[:-1]])
+        path = np.stack([0.5 * (before + path), path], axis=1).reshape(-1, *path.shape[1:])
+    forces = {node: np.repeat(f, 2, axis=0) if f.ndim == 2 else f for node, f in scene.forces.items()}
+    return scene.replace(pin_path=path, forces=forces)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import InputError, choice, finite_array, indices, number
+from .errors import InputError, NoAttributeError, choice, finite_array, indices, number
 from .topology import Topology, rectangle
 from .weave import Weave
 
@@ -31,19 +31,70 @@ class Yarn:
     color: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
-        number("density", self.density, above=0.0)
-        number("stretch", self.stretch, least=0.0)
-        number("bend", self.bend, least=0.0)
+        keep = functools.partial(object.__setattr__, self)  # frozen
+        keep("density", number("density", self.density, above=0.0))
+        keep("stretch", number("stretch", self.stretch, least=0.0))
+        keep("bend", number("bend", self.bend, least=0.0))
         if self.color is not None:
             color = finite_array("color", self.color, (3,))
             if color.min() < 0.0 or color.max() > 1.0:
                 raise InputError(f"color = {self.color}, must be three numbers from 0 to 1")
+            keep("color", tuple(color.tolist()))
 
+
+CLOTH_NUMBERS = (
+    "spacing",
+    "radius",
+    "shear",
+    "friction",
+    "friction_stiffness",
+    "friction_damping",
+    "friction_sharpness",
+    "parallel_stiffness",
+)
+"""The cloth's own numbers, as its arguments and the kernels' arrays name them."""
 
 POSES = ("upright", "flat")
 
 
-class Cloth:
+class Fixed:
+    """What cannot be changed once it is made: simulators take its values when they are made themselves."""
+
+    _arguments: dict[str, Any]
+    """All that it was made of."""
+
+    def _fix(self, **arguments: Any) -> None:
+        """Ends the making: arrays and attributes are read-only from now on."""
+        self._arguments = arguments
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_arguments" in vars(self):
+            kind = type(self).__name__
+            raise NoAttributeError(
+                f"{kind.lower()}.{name} cannot be set: a {kind} does not change once it is made, and simulators would "
+                f"not know; make another one, such as by {kind.lower()}.replace({name}=...)"
+            )
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise NoAttributeError(f"{type(self).__name__.lower()}.{name} cannot be deleted")
+
+    def replace(self, **changes: Any) -> Any:
+        """Makes another one, of the same arguments but for these.
+
+        Raises:
+            InputError: an argument that there is not, or a value that does not go with the others.
+        """
+        for name in changes:
+            if name not in self._arguments:
+                raise InputError(f"replace({name}=...): must be one of {', '.join(self._arguments)}")
+        return type(self)(**{**self._arguments, **changes})
+
+
+class Cloth(Fixed):
     """A rectangle of woven cloth at rest.
 
     Node (row j, column i) has index i + j·columns. Warp yarn j runs through row j, along u; weft yarn i through
@@ -86,6 +137,8 @@ class Cloth:
         if not isinstance(weave, Weave):
             raise InputError(f"weave = {weave!r}, must be a Weave, such as Weave.plain(rows=17, columns=17)")
         self.weave = weave
+        if not isinstance(yarns, Sequence):
+            raise InputError(f"yarns = {yarns!r}, must be a list of at least one Yarn")
         self.yarns = tuple(yarns)
         if not self.yarns or not all(isinstance(yarn, Yarn) for yarn in self.yarns):
             raise InputError(f"yarns = {yarns!r}, must be a list of at least one Yarn")
@@ -108,7 +161,27 @@ class Cloth:
         self.friction_sharpness = number("friction_sharpness", friction_sharpness, above=0.0)
         self.parallel_stiffness = number("parallel_stiffness", parallel_stiffness, least=0.0)
         self.position = self._pose(pose)
-        self.position.setflags(write=False)
+        self._fix(
+            weave=weave,
+            yarns=self.yarns,
+            warp=None if warp is None else self.warp,
+            weft=None if weft is None else self.weft,
+            **{name: getattr(self, name) for name in CLOTH_NUMBERS},
+            pose=pose if isinstance(pose, str) else self.position,
+        )
+
+    def __repr__(self) -> str:
+        return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"
+
+    def same_as(self, other: Cloth) -> bool:
+        """Whether another one is made of the same, whatever their weaves are called."""
+        return (
+            np.array_equal(self.weave.flipped, other.weave.flipped)
+            and [dataclasses.replace(yarn, color=None) for yarn in self.yarns]
+            == [dataclasses.replace(yarn, color=None) for yarn in other.yarns]
+            and all(getattr(self, name) == getattr(other, name) for name in CLOTH_NUMBERS)
+            and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in ("warp", "weft", "position"))
+        )
 
     @property
     def nodes(self) -> int:
@@ -137,6 +210,8 @@ class Cloth:
     def node(self, row: int, column: int) -> int:
         """Index of a node; negative rows and columns count from the end."""
         rows, columns = self.weave.rows, self.weave.columns
+        if not (isinstance(row, int | np.integer) and isinstance(column, int | np.integer)):
+            raise InputError(f"node (row {row!r}, column {column!r}), must be two whole numbers")
         if not -rows <= row < rows or not -columns <= column < columns:
             raise InputError(f"node (row {row}, column {column}) is outside a cloth of {rows} × {columns}")
         return int(column % columns + (row % rows) * columns)
@@ -151,9 +226,11 @@ class Cloth:
     def _materials(self, name: str, value: Sequence[int] | np.ndarray | None, count: int) -> np.ndarray:
         if value is None:
             return np.arange(count) % len(self.yarns)
+        if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or np.ndim(value) == 0:
+            raise InputError(f"{name} = {value!r}, must be the materials of {count} yarns, a list of whole numbers")
         if len(value) != count:
             raise InputError(f"{name} names the material of {len(value)} yarns, must be of {count}")
-        for k in set(value):
+        for k in value:
             indices(name, [k], len(self.yarns), "material")
         return np.array(value)
 

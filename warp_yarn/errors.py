@@ -15,6 +15,10 @@ class InputError(WarpYarnError, ValueError):
     """An argument or a file that cannot be used. The message names it, its value and what is allowed."""
 
 
+class NoAttributeError(InputError, AttributeError):
+    """An attribute that cannot be had, or cannot be set."""
+
+
 class SimulationError(WarpYarnError, RuntimeError):
     """A step that could not be made.
 
@@ -54,7 +58,10 @@ class GradientError(WarpYarnError, RuntimeError):
 def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     """value as a new float64 array of the shape (None: any length), or an InputError."""
     try:
-        array = np.array(value, dtype=np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind not in "biuf":  # NumPy would read text, and drop imaginary parts
+            raise TypeError(f"of type {given.dtype}")
+        array = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
     wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
@@ -74,18 +81,22 @@ def number(name: str, value: Any, *, above: float | None = None, least: float | 
     if least is not None:
         allowed = f"finite and at least {least:g}"
     try:
+        if isinstance(value, str | bytes):
+            raise TypeError("text")
         result = float(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} = {value!r}, must be a number, {allowed}") from error
     if not np.isfinite(result) or (above is not None and result <= above) or (least is not None and result < least):
         raise InputError(f"{name} = {value!r}, must be {allowed}")
     return result
 
 
-def whole(name: str, value: Any, *, least: int) -> int:
-    """value as an int of at least `least`, or an InputError."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} = {value!r}, must be a whole number, at least {least}")
+def whole(name: str, value: Any, *, least: int, most: int | None = None) -> int:
+    """value as an int of at least `least` and at most `most`, or an InputError."""
+    wrong = isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least
+    if wrong or (most is not None and value > most):
+        allowed = f"at least {least}" if most is None else f"from {least} to {most}"
+        raise InputError(f"{name} = {value!r}, must be a whole number, {allowed}")
     return int(value)
 
 
@@ -99,7 +110,10 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
 
 def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:
     """value as an int32 array of distinct indices below count, or an InputError."""
-    array = np.atleast_1d(np.asarray(value))
+    try:
+        array = np.atleast_1d(np.asarray(value))
+    except ValueError:  # ragged
+        array = np.empty((1, 1))
     if array.size == 0:
         return np.zeros(0, dtype=np.int32)
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):

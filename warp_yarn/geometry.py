@@ -13,6 +13,7 @@ import warp as wp
 
 from .cloth import Cloth
 from .errors import InputError, finite_array
+from .exclusive import ALONE, compiling, refuse_recording
 from .kernels import Variant, build
 from .state import Trajectory
 
@@ -154,17 +155,19 @@ def checked(trajectory: Trajectory) -> np.ndarray:
 
 def contact_normals(cloth: Cloth, position: np.ndarray) -> np.ndarray:
     """Unit normal from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
-    kernel = build(Variant(wp.float64, True))["contact_normal"]
-    topology = cloth.topology
-    positions = wp.array(position, dtype=wp.vec3d, device="cpu")
-    normals = wp.zeros_like(positions)
-    crossings = wp.array(topology.crossing_node, dtype=int, device="cpu")
-    neighbours = wp.array(topology.crossing_neighbours, dtype=wp.vec4i, device="cpu")
-    flipped = wp.array(topology.flipped, dtype=int, device="cpu")
-    for frame in range(len(position)):
-        inputs = [crossings, neighbours, flipped, positions[frame], normals[frame]]
-        wp.launch(kernel, dim=len(crossings), inputs=inputs, device="cpu")
-    return normals.numpy()
+    topology, device = cloth.topology, wp.get_device("cpu")
+    with ALONE, compiling():
+        refuse_recording(device)
+        kernel = build(Variant(wp.float64, True))["contact_normal"]
+        positions = wp.array(position, dtype=wp.vec3d, device=device)
+        normals = wp.zeros_like(positions)
+        crossings = wp.array(topology.crossing_node, dtype=int, device=device)
+        neighbours = wp.array(topology.crossing_neighbours, dtype=wp.vec4i, device=device)
+        flipped = wp.array(topology.flipped, dtype=int, device=device)
+        for frame in range(len(position)):
+            inputs = [crossings, neighbours, flipped, positions[frame], normals[frame]]
+            wp.launch(kernel, dim=len(crossings), inputs=inputs, device=device)
+        return normals.numpy()
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

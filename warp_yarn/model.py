@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from . import exclusive
 from .arrays import Arrays
 from .errors import InputError, choice, number, whole
 from .kernels import Term, Variant, build
@@ -69,10 +70,8 @@ class Graphs(dict[str, Any]):
     def run(self, name: str, part: Callable[[], None]) -> None:
         """Launches what a function launches; the function is called the first time alone."""
         if name not in self:
-            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                part()
-            self[name] = capture.graph
-        wp.capture_launch(self[name])
+            self[name] = exclusive.capture(self.device, part)
+        exclusive.replay(self[name])
 
 
 class Model:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .arrays import STATE_TYPES
+from .exclusive import ALONE
 from .kernels.step import GAINED, INACCURATE
 from .model import Graphs, Model
 
@@ -43,10 +44,13 @@ class Parts:
     def __init__(self, model: Model, method: Any, allowed: float | None, fallback: Callable[[], Any] | None = None):
         self.model, self.method, self.allowed = model, method, allowed
         self._make_fallback, self._fallback = fallback, None
-        self.damped = 0
-        self.size = self.tried = 1.0
-        self.made = self.rejected = 0
+        self.reset()
         self._graphs = Graphs(model.device)
+
+    def reset(self) -> None:
+        """Begins anew, as for another motion."""
+        self.size = self.tried = 1.0
+        self.made = self.rejected = self.damped = 0
 
     def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
@@ -102,7 +106,9 @@ class Parts:
 
     def _damp(self, count: Callable[[], None], size: float, left: float) -> bool:
         """Makes a part by the fallback; whether it is good."""
-        self._fallback = self._fallback or self._make_fallback()
+        if self._fallback is None:
+            with ALONE:
+                self._fallback = self._make_fallback()
         self.model.arrays.put("damps", 1)
         accepted = self._try(self._fallback, count, size, left)
         self.model.arrays.put("damps", 0)
@@ -119,7 +125,7 @@ class Parts:
 
     def _restore(self) -> None:
         """Goes back to where the part started."""
-        self.model.arrays.zero("status")
+        self.model.arrays.put("status", 0, 0, 0)
         self._copy("", "kept_")
 
     def _accepts(self, size: float) -> bool:
@@ -144,7 +150,8 @@ class Parts:
         """The state, put by or brought back."""
         model, a = self.model, self.model.arrays
         moving = [name for name in (*STATE_TYPES, "bounds") if a[name] is not None]
-        if "kept_position" not in a:
-            for name in moving:
-                a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)
+        for name in moving:
+            if f"kept_{name}" not in a:
+                with ALONE:
+                    a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)
         self._graphs.run(target, lambda: model.copy(**{target + name: source + name for name in moving}))

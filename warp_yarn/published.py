@@ -78,7 +78,8 @@ def read_published(path: str | os.PathLike) -> Published:
     """Reads a file of the paper's published data. Needs warp_yarn[data].
 
     Raises:
-        InputError: h5py is not installed, or the file is missing, not HDF5, damaged, or not of this structure.
+        InputError: h5py is not installed, or the file is missing, open in another program, not HDF5, damaged, or not of
+            this structure.
     """
     try:
         import h5py
@@ -92,7 +93,11 @@ def read_published(path: str | os.PathLike) -> Published:
             return _read(file)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (OSError, RuntimeError) as error:  # what the HDF5 library says of foreign, truncated and damaged files
+    except BlockingIOError as error:
+        raise InputError(f"{path}: another program has it open to write to it; close it there ({error})") from error
+    except (MemoryError, RecursionError) as error:  # of sizes that a damaged file says
+        raise InputError(f"{path}: damaged, or too large for this machine ({error})") from error
+    except Exception as error:  # what h5py and NumPy say of foreign, truncated and damaged files is of every kind
         raise InputError(f"{path}: not a whole HDF5 file ({error})") from error
 
 
@@ -150,7 +155,7 @@ def _dataset(file: h5py.File, name: str) -> np.ndarray:
 
 def _record(file: h5py.File, name: str, fields: tuple[str, ...]) -> list[float]:
     """The numbers of a dataset of one record."""
-    data = _dataset(file, name)
+    data = np.asarray(_dataset(file, name))
     missing = [field for field in fields if field not in (data.dtype.names or ())]
     if missing:
         raise InputError(f"{name!r} has no field {missing[0]!r}")

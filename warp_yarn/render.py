@@ -26,6 +26,9 @@ LENS = 24.0
 """Vertical angle of view [degrees]: narrow, so that near and far yarns look equally thick."""
 MARGIN = 1.08
 """Size of the picture over that of what is in it."""
+BACKGROUND = "#dbdee3"
+OVERSAMPLING = 5.0**0.5
+"""Of VTK's anti-aliasing, along either axis."""
 SURFACE = {"ambient": 0.15, "diffuse": 0.9, "specular": 0.12, "specular_power": 12}
 LIGHTS = (((-0.6, 0.6, 0.9), 0.85), ((0.8, -0.3, 0.7), 0.35), ((0.0, -0.9, 0.4), 0.2), ((0.3, 0.9, -0.5), 0.4))
 """Where lights stand as the camera sees it (right, up, toward it), in distances to the camera, and how bright they are:
@@ -42,13 +45,14 @@ def write_png(
 ) -> None:
     """Draws one frame of a trajectory: every yarn a smooth tube in the colour of its material.
 
-    Needs ``warp_yarn[render]``. The file appears whole or not at all.
+    Needs ``warp_yarn[render]``. The same picture is the same to the last pixel on one machine. The file appears whole
+    or not at all.
 
     Args:
         path: of the picture, ending in .png.
         trajectory: what to draw, at least one frame.
         frame: which frame; negative ones count from the end.
-        size: width and height in pixels, at least 16.
+        size: width and height in pixels, at least 16, at most what the machine's OpenGL can draw (7327 in software).
         view: direction from the cloth to the camera, 3 numbers, not vertical.
 
     Raises:
@@ -86,7 +90,7 @@ def write_mp4(
         trajectory: what to draw, at least one frame.
         frames_per_second: pictures in one second of playing time, above 0.
         slowdown: seconds of playing time for one second of simulated time, above 0.
-        size: width and height in pixels, even, at least 16.
+        size: width and height in pixels, even, at least 16, at most as of a picture.
         view: direction from the cloth to the camera, 3 numbers, not vertical.
         progress: show a progress bar.
 
@@ -122,7 +126,10 @@ class _Picture:
         pv = _pyvista()
         self.tubes = [Tubes.around(part, radius, sides=SIDES, samples=SAMPLES) for part in parts]
         self.plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
-        self.plotter.set_background("#bfc5cd", top="#f6f7f8")
+        self._check_size(size)
+        # one colour: a gradient is drawn by a shader that leaves what the shading of nooks reads undefined, so that
+        # pictures would differ from time to time
+        self.plotter.set_background(BACKGROUND)
         self.meshes = []
         for tubes, part in zip(self.tubes, parts, strict=True):
             corners, vertices = tubes.faces()
@@ -141,6 +148,15 @@ class _Picture:
         self.plotter.enable_anti_aliasing("ssaa")
         # Yarns darken where others are near: without it one does not see which lies over which.
         self.plotter.enable_ssao(radius=3.0 * radius, bias=0.1 * radius, kernel_size=16)
+
+    def _check_size(self, size: tuple[int, int]) -> None:
+        """Refuses what the machine's OpenGL has no textures for: it would be black."""
+        textures = _extra("vtkmodules.vtkRenderingOpenGL2").vtkTextureObject
+        self.plotter.render_window.Initialize()
+        largest = int(textures.GetMaximumTextureSize(self.plotter.render_window) / OVERSAMPLING)
+        if max(size) > largest > 0:
+            self.plotter.close()
+            raise InputError(f"size = {size}, must be at most {largest} pixels wide and high on this machine")
 
     def __enter__(self) -> _Picture:
         return self
@@ -206,7 +222,7 @@ def _check_ending(path: str | os.PathLike, ending: str) -> None:
 
 
 def _checked_size(size: Sequence[int]) -> tuple[int, int]:
-    if not isinstance(size, Sequence) or len(size) != 2:
+    if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
         raise InputError(f"size = {size!r}, must be a width and a height in pixels")
     return whole("size[0]", size[0], least=16), whole("size[1]", size[1], least=16)
 

@@ -1,12 +1,15 @@
 """What happens to a cloth: gravity, wind, pins, applied forces, and which terms are modelled at all."""
 
+from __future__ import annotations
+
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from .cloth import Cloth
+from .cloth import Cloth, Fixed
 from .errors import InputError, choice, finite_array, indices, number
 from .kernels import TERMS
 
@@ -26,13 +29,16 @@ class Wind:
     drag: float = 0.5
 
     def __post_init__(self) -> None:
-        finite_array("wind velocity", self.velocity, (3,))
-        number("wind density", self.density, least=0.0)
-        number("wind drag", self.drag, least=0.0)
+        # copies: an array that the caller writes to again is not this wind
+        keep = functools.partial(object.__setattr__, self)
+        keep("velocity", tuple(finite_array("wind velocity", self.velocity, (3,)).tolist()))
+        keep("density", number("wind density", self.density, least=0.0))
+        keep("drag", number("wind drag", self.drag, least=0.0))
 
 
-class Scene:
-    """A cloth, what acts on it, and the terms of the model that it wants.
+class Scene(Fixed):
+    """A cloth, what acts on it, and the terms of the model that it wants. It does not change: ``replace`` makes
+    another one.
 
     Args:
         cloth: the cloth.
@@ -76,26 +82,83 @@ class Scene:
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
-        forces = forces or {}
-        self.force_nodes = indices("forces", list(forces), cloth.nodes, "node")
-        self.force_path = self._force_path(forces)
+        checked = self._checked_forces(forces)
+        self.force_nodes = indices("forces", list(checked), cloth.nodes, "node")
+        self.force_path = self._force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
         self.terms = self._terms(terms)
+        self._fix(
+            cloth=cloth,
+            gravity=self.gravity,
+            wind=wind,
+            pins=self.pins,
+            pin_stiffness=self.pin_stiffness,
+            pin_path=self.pin_path,
+            forces=checked,
+            sliding=self.sliding,
+            terms=None if terms is None else self.terms,
+            published_scaling=self.published_scaling,
+        )
 
-    def _force_path(self, forces: dict[int, Any]) -> np.ndarray:
+    def __repr__(self) -> str:
+        return f"Scene({self.cloth}, terms {', '.join(self.terms)}, sliding {self.sliding})"
+
+    @property
+    def forces(self) -> dict[int, np.ndarray]:
+        """Forces on nodes [N]: {node: 3 numbers, or steps × 3}, the argument that would give these."""
+        result = {}
+        for k, node in enumerate(self.force_nodes.tolist()):
+            path = self.force_path[:, k]
+            result[node] = path[-1] if (path == path[-1]).all() else path[:-1]
+        return result
+
+    def same_as(self, other: Scene) -> bool:
+        """Whether another one asks for the same motion."""
+
+        def values(scene: Scene) -> list[np.ndarray]:
+            missing = np.zeros(0)
+            arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
+            return [missing if array is None else array for array in arrays]
+
+        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling")
+        return (
+            self.cloth.same_as(other.cloth)
+            and all(getattr(self, name) == getattr(other, name) for name in names)
+            and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
+        )
+
+    @staticmethod
+    def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
+        """{node: 3 numbers, or steps × 3}."""
+        if forces is None:
+            return {}
+        if not isinstance(forces, Mapping):
+            raise InputError(f"forces = {forces!r}, must be a dictionary, {{node: 3 numbers, or steps × 3}}")
+        result = {}
+        for node, value in forces.items():
+            name = f"forces[{node!r}]"
+            try:
+                steps = np.ndim(value) == 2
+            except ValueError as error:  # ragged
+                raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
+            result[node] = finite_array(name, value, (None, 3) if steps else (3,))
+            result[node].setflags(write=False)
+        return result
+
+    @staticmethod
+    def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
         """[steps + 1, nodes with a force, 3]; the last row is what stays."""
-        values = [np.asarray(value, dtype=np.float64) for value in forces.values()]
-        steps = max((len(value) for value in values if value.ndim == 2), default=0)
-        path = np.zeros((steps + 1, len(values), 3))
-        for k, (node, value) in enumerate(zip(forces, values, strict=True)):
-            if value.ndim == 2:
-                path[: len(value), k] = finite_array(f"forces[{node}]", value, (None, 3))
-            else:
-                path[:, k] = finite_array(f"forces[{node}]", value, (3,))
+        steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
+        path = np.zeros((steps + 1, len(forces), 3))
+        for k, value in enumerate(forces.values()):
+            path[: len(value) if value.ndim == 2 else steps + 1, k] = value
         return path
 
     def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
+        if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
+            raise InputError(f"terms = {names!r}, must be a list of names")
+        names = None if names is None else tuple(names)
         useless = {name: "yarns do not slide (sliding=False)" for name, t in TERMS.items() if t.sliding_only}
         missing = {} if self.sliding else useless
         if self.gravity is None:
@@ -108,10 +171,14 @@ class Scene:
             missing["applied"] = "forces is empty"
         if names is None:
             return tuple(name for name in TERMS if name not in missing)
-        if isinstance(names, str):
-            raise InputError(f"terms = {names!r}, must be a list of names")
         for name in names:
             choice("terms", name, TERMS)
             if name in missing:
                 raise InputError(f"terms names {name!r}, but {missing[name]}")
         return tuple(name for name in TERMS if name in names or name == "mass")
+
+    def __copy__(self) -> Scene:
+        """A copy to be changed before it is used, as ``learn.with_values`` does."""
+        result = object.__new__(type(self))
+        vars(result).update({name: value for name, value in vars(self).items() if name != "_arguments"})
+        return result

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:  # who writes no USD file need not load its library: functions
     from pxr import UsdGeom
 
 ENDINGS = (".usd", ".usda", ".usdc")
+COARSE = 1e-4
 TUBE_SAMPLES = 4
 """Rings a segment: chords between them are within 7 % of the radius of the curve, in the paper's weaves."""
 
@@ -33,7 +36,9 @@ def write_usd(
 
     Yarns are cubic Catmull-Rom curves (``UsdGeom.BasisCurves``) with their end points repeated, as wide as the yarn,
     over and under each other as the draft says. Frame k is at time code k. Lengths are in metres, z is up.
-    The file appears whole or not at all.
+    Points are in single precision. Where that would be too coarse, far from the origin, they are relative to a
+    translation of /cloth, which is in double precision. The file appears whole or not at all; stages of this process
+    that have an older one open show the new one.
 
     Args:
         path: of the file, ending in .usd, .usda (text) or .usdc (binary).
@@ -46,37 +51,88 @@ def write_usd(
 
     Raises:
         InputError: an argument is out of its range, or the folder of `path` does not exist.
+        OSError: the file cannot be written, such as to a full disk.
     """
-    from pxr import Usd, UsdGeom
-
     slowdown = number("slowdown", slowdown, above=0.0)
     sides = whole("sides", sides, least=3)
     if Path(path).suffix not in ENDINGS:
         raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
-    with whole_file(path) as temporary:
-        parts = strands(trajectory)
-        stage = Usd.Stage.CreateNew(str(temporary))
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-        rate = 1.0 / (trajectory.step * slowdown)
-        stage.SetTimeCodesPerSecond(rate)
-        stage.SetFramesPerSecond(rate)
-        stage.SetStartTimeCode(0)
-        stage.SetEndTimeCode(len(trajectory) - 1)
-        cloth = UsdGeom.Xform.Define(stage, "/cloth")
-        stage.SetDefaultPrim(cloth.GetPrim())
-        radius = trajectory.cloth.radius
-        for part in parts:
-            prim_path = cloth.GetPath().AppendChild(f"yarn_{part.material}")
-            if tubes:
-                shape = Tubes.around(part, radius, sides=sides, samples=TUBE_SAMPLES)
-                _write_mesh(UsdGeom.Mesh.Define(stage, prim_path), shape, part)
-            else:
-                _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, radius)
-        stage.Save()
+    parts = strands(trajectory)
+    with whole_file(path) as temporary, writing(path):
+        # a function of its own, so that no stage holds the file when it is moved: Windows would not move it
+        _write_stage(temporary, trajectory, parts, tubes=tubes, rate=1.0 / (trajectory.step * slowdown), sides=sides)
+    reload(path)
 
 
-def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float) -> None:
+@contextlib.contextmanager
+def writing(path: str | os.PathLike) -> Iterator[None]:
+    """Turns what USD says of a file that it cannot write into an OSError."""
+    from pxr import Tf
+
+    try:
+        yield
+    except Tf.ErrorException as error:
+        lines = [line for line in str(error).splitlines() if line.strip()]
+        raise OSError(f"{path} cannot be written: {lines[0].rpartition(' : ')[2]}") from error
+
+
+def reload(path: str | os.PathLike) -> None:
+    """Makes USD read a file again, where this process has it open: it keeps layers by their paths."""
+    from pxr import Sdf
+
+    real = os.path.realpath(path)
+    for layer in Sdf.Layer.GetLoadedLayers():
+        if layer.realPath and os.path.realpath(layer.realPath) == real:
+            layer.Reload(force=True)
+
+
+def _write_stage(
+    path: Path, trajectory: Trajectory, parts: list[Strands], *, tubes: bool, rate: float, sides: int
+) -> None:
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(trajectory) - 1)
+    cloth = UsdGeom.Xform.Define(stage, "/cloth")
+    stage.SetDefaultPrim(cloth.GetPrim())
+    radius = trajectory.cloth.radius
+    origin = origins(trajectory)
+    if origin.any():
+        translate = cloth.AddTranslateOp()
+        if (origin == origin[0]).all():
+            translate.Set(Gf.Vec3d(*origin[0].tolist()))
+        else:
+            for frame, place in enumerate(origin.tolist()):
+                translate.Set(Gf.Vec3d(*place), frame)
+    for part in parts:
+        prim_path = cloth.GetPath().AppendChild(f"yarn_{part.material}")
+        if tubes:
+            shape = Tubes.around(part, radius, sides=sides, samples=TUBE_SAMPLES)
+            _write_mesh(UsdGeom.Mesh.Define(stage, prim_path), shape, part, origin)
+        else:
+            _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, radius, origin)
+    stage.Save()
+
+
+def origins(trajectory: Trajectory) -> np.ndarray:
+    """Where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would move
+    them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
+    position = trajectory.position
+    low, high = position.min(axis=1), position.max(axis=1)
+    reach = COARSE * trajectory.cloth.radius / np.finfo(np.float32).epsneg
+    middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
+    for origin in (np.zeros(3), middle):
+        if max(np.abs(low - origin).max(), np.abs(high - origin).max()) <= reach:
+            return np.broadcast_to(origin, (len(position), 3))
+    return 0.5 * (low + high)
+
+
+def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, origin: np.ndarray) -> None:
     from pxr import UsdGeom, Vt
 
     curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
@@ -89,10 +145,10 @@ def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float) -> 
     _write_color(curves, part)
     repeated = part.repeated
     for frame, points in enumerate(part.points):
-        _write_points(curves, frame, points[repeated], radius)
+        _write_points(curves, frame, points[repeated] - origin[frame], radius)
 
 
-def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands) -> None:
+def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndarray) -> None:
     from pxr import Vt
 
     corners, vertices = shape.faces()
@@ -100,7 +156,7 @@ def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands) -> None:
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(vertices.astype(np.int32)))
     _write_color(mesh, part)
     for frame in range(len(part.points)):
-        _write_points(mesh, frame, shape.vertices(frame), 0.0)
+        _write_points(mesh, frame, shape.vertices(frame) - origin[frame], 0.0)
 
 
 def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
