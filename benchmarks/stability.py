@@ -73,11 +73,11 @@ class Case:
     def cloth(self) -> wy.Cloth:
         make = FABRICS[self.fabric]
         cloth = make(rows=self.size, columns=self.size, weave=self.weave, friction=self.friction)
-        cloth.yarns = tuple(
+        yarns = [
             dataclasses.replace(yarn, stretch=self.stretch * yarn.stretch, density=self.density * yarn.density)
             for yarn in cloth.yarns
-        )
-        return cloth
+        ]
+        return cloth.replace(yarns=yarns)
 
     def scene(self, **options: Any) -> wy.Scene:
         return paper.hung(self.cloth(), **options)

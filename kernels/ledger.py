@@ -92,12 +92,13 @@ def define(variant: Variant) -> SimpleNamespace:
         pin_motion: wp.array(dtype=vec3),
         step_duration: scalar,
         position: wp.array(dtype=vec3),
-        power: wp.array(dtype=scalar),
+        stage: int,
+        pin_power: wp.array(dtype=scalar),
     ):
         """Power of moving pins: the force of their springs times their velocity."""
         e = index(wp.tid())
         pull = (pin_target[e] - position[index(pin_node[e])]) * pin_stiffness[0]
-        wp.atomic_add(power, 0, wp.dot(pull, pin_motion[e]) / step_duration)
+        wp.atomic_add(pin_power, stage, wp.dot(pull, pin_motion[e]) / step_duration)
 
     @wp.kernel(module=module, enable_backward=False)
     def suspect(
@@ -119,6 +120,8 @@ def define(variant: Variant) -> SimpleNamespace:
         elastic_energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
         power: wp.array(dtype=scalar),
+        pin_power: wp.array(dtype=scalar),
+        first_share: scalar,
         gain: wp.array(dtype=scalar),
         still_energy: wp.array(dtype=scalar),
         step_size: wp.array(dtype=scalar),
@@ -132,7 +135,11 @@ def define(variant: Variant) -> SimpleNamespace:
         """Compares the end of a step with the bounds, which move on if the step is good."""
         if status[0] == 0:
             # methods take the force or the velocity of either end: the largest that the power may have been
-            work = wp.max(wp.max(power[0], power[1]), bounds[3]) * step_size[0]
+            last = power[0] + pin_power[1]
+            most = wp.max(wp.max(last, power[1] + pin_power[1]), bounds[3])
+            # pins that start at once push in the first stage
+            most = wp.max(most, last + first_share * (pin_power[0] - pin_power[1]))
+            work = most * step_size[0]
             inner = energy[0] + elastic_energy[0]
             total = inner + height_energy[0]
             room = gain[0] * wp.max(inner, bounds[2]) + still_energy[0]
@@ -149,7 +156,7 @@ def define(variant: Variant) -> SimpleNamespace:
             else:
                 bounds[0] += work
                 bounds[1] += work
-                bounds[3] = power[0]
+                bounds[3] = last
                 bounds[4] = elastic_energy[0]
                 alert[0] = wp.max(alert[0] - 1, 0)
                 steps_to_audit[0] = steps_to_audit[0] - 1

@@ -14,6 +14,7 @@ import pytest
 import warp as wp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from test_hard_states import STATES
 from test_integrators import fails_at_first
 
 import warp_yarn as wy
@@ -165,6 +166,45 @@ def test_steps_in_parts_are_interrupted_anywhere():
         assert sim.steps_done or not sim.split_steps
         check_goes_on(sim, whole)
         assert sim.split_steps == split
+
+
+def test_damped_steps_are_interrupted_anywhere():
+    """Steps that gain energy, which another method makes: in new simulators, where it is made too, and in one."""
+    hard = STATES["swapped"]()
+
+    def started(sim: wy.Simulator) -> wy.Simulator:
+        sim.reset()
+        sim.state = hard.start(0)
+        return sim
+
+    def make() -> wy.Simulator:
+        return started(wy.Simulator(hard.scene))
+
+    sim = make()
+    with interrupted_at(0) as first:
+        whole = sim.run(3)
+    damped, split = set(sim.damped_steps), dict(sim.split_steps)
+    counts = (sim.parts.made, sim.parts.rejected, sim.parts.damped)
+    assert damped and sim.parts.damped
+    with interrupted_at(0) as later:
+        assert same(started(sim).run(3), whole)
+    used = sim
+    places = [(make, k) for k in np.linspace(1, first[0], 20).astype(int)]
+    places += [(lambda: started(used), k) for k in np.linspace(1, later[0], 80).astype(int)]
+    for begin, place in places:
+        sim = begin()
+        with contextlib.suppress(_Stop), interrupted_at(int(place)):
+            sim.run(3)
+        done = sim.steps_done  # settles what is half done
+        assert all(k <= done for k in (*sim.damped_steps, *sim.split_steps))
+        assert sim.arrays["damps"].numpy()[0] == 0
+        check_goes_on(sim, whole)
+        assert (sim.damped_steps, sim.split_steps) == (damped, split)
+        assert (sim.parts.made, sim.parts.rejected, sim.parts.damped) == counts
+    other = pickle.loads(pickle.dumps(sim))
+    assert (other.damped_steps, other.split_steps) == (damped, split)
+    sim.reset()
+    assert sim.damped_steps == set() and sim.parts.damped == 0
 
 
 def test_a_team_is_interrupted_anywhere():

@@ -30,8 +30,8 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-AT_END = 2
-"""The place of a step's end among ``stage_times``, behind those of two stages."""
+AT_END, AT_BEGINNING = 2, 3
+"""The places of a step's end and beginning among ``stage_times``, behind those of two stages."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
 CHEAP_ENERGIES = {
@@ -192,8 +192,8 @@ class Model:
         a = self.arrays
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
-        reached = [1.0 if self.held else begun + time * step / self.step_size for time in (*times, 1.0)]
-        a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)))
+        times = (*times, *[1.0] * (3 - len(times)), 0.0)
+        a.put("stage_times", *[1.0 if self.held else begun + time * step / self.step_size for time in times])
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("weights", 1.0, stage, stage * stage)
@@ -330,15 +330,19 @@ class Model:
         if a["anchor"] is not None:
             self.launch("drag_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
 
-    def end_step(self) -> None:
-        """What every method ends a step with, its end state in place: checks and moves on, and records the frame."""
+    def end_step(self, first_share: float = 0.0) -> None:
+        """What every method ends a step with, its end state in place: checks and moves on, and records the frame.
+
+        Args:
+            first_share: of the step in which the forces of the first of two stages act.
+        """
         if self.scene.sliding:
             self.launch("check_order", "segments")
         if "pin_motion" in self.arrays:
             # pins are looked at where they are now, not where they were at the last stage's time
             self.take_inputs(AT_END)
         if self.watches:
-            self._close_step()
+            self._close_step(first_share)
         self.drag_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
@@ -377,7 +381,8 @@ class Model:
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
         self.watches = not (self.held and self.scene.pin_path is not None)
-        for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 2), ("bounds", 5)):
+        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "pin_power": 2, "bounds": 5}
+        for name, count in counts.items():
             a[name] = a.zeros(count, a.variant.scalar)
         for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
             a[name] = a.zeros(1, wp.int32)
@@ -402,6 +407,8 @@ class Model:
             wp.capture_if(self.arrays["audit_due"], on_true=self._audit)
 
     def _audit(self) -> None:
+        # another state or step may have come since the last step's end
+        self.take_inputs(AT_BEGINNING)
         self.press()
         self.arrays.zero("energy", "elastic_energy", "height_energy")
         self._add_energies(cheap=True)
@@ -417,7 +424,7 @@ class Model:
                 energy = self.arrays[CHEAP_ENERGIES.get(term.name, "energy")]
                 self.launch(f"{term.name}_energy", term.elements, energy=energy)
 
-    def _close_step(self) -> None:
+    def _close_step(self, first_share: float) -> None:
         """Compares the energy at the end of a step with the work done in it."""
         a = self.arrays
         a.zero("energy", "elastic_energy", "height_energy")
@@ -425,7 +432,8 @@ class Model:
         self.launch("suspect", 1)
         wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
         self._add_powers()
-        self.launch("close_step", 1)
+        self.launch("close_step", 1, first_share=first_share)
+        a.zero("pin_power")
         if self._outer:
             self.launch("keep_outer_force", "nodes", force=a["q_x"])
 
@@ -449,5 +457,10 @@ class Model:
             # the forces go where the solver works
             self._add_outer_forces("q_x")
             self.launch("add_power", "nodes", force=a["q_x"])
-        if "pin_motion" in a and not self.held:
-            self.launch("add_pin_power", "pins", step_duration=self.step_size)
+        self.add_pin_power(1)
+
+    def add_pin_power(self, stage: int) -> None:
+        """Finds the power of moving pins, at the first stage, 0, of two, or at the end of a step, 1."""
+        pulls = any(term.name == "pins" for term in self.arrays.terms)
+        if self.watches and pulls and "pin_motion" in self.arrays:
+            self.launch("add_pin_power", "pins", step_duration=self.step_size, stage=stage)

@@ -673,7 +673,7 @@ class _Visit:
         simulator._owed = go_home
         simulator.arrays.put("counters", 0, self.row)
         # before the first step, pins are where they start
-        simulator.arrays.put("stage_times", *[float(self.ahead or simulator._steps_done > 0)] * 3)
+        simulator.arrays.put("stage_times", *[float(self.ahead or simulator._steps_done > 0)] * 4)
         simulator.model.take_inputs()
         if self.visited is not None:
             simulator._upload(self.visited)

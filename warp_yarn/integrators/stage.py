@@ -106,6 +106,7 @@ class StageMethod:
         self._begin()
         for stage in range(self.stages):
             if stage:
+                model.add_pin_power(0)
                 model.take_inputs(stage)
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
@@ -122,7 +123,7 @@ class StageMethod:
                 velocity="base_velocity",
                 euler_velocity="base_euler_velocity",
             )
-        model.end_step()
+        model.end_step(1.0 - self.fraction if self.stages == 2 else 0.0)
 
     def estimate_errors(self) -> None:
         """Makes steps leave an estimate of their error in ``step_error`` [m]: c h³ (a₂ − a₁)/(t₂ − t₁), of the
