@@ -1,8 +1,13 @@
 """Learning from frames: the problem, the search, what it leaves open, and scenes/learn.py; eq. 2, at most 5 × 5."""
 
+import concurrent.futures
+import copy
 import csv
 import dataclasses
 import json
+import multiprocessing
+import pickle
+from fractions import Fraction
 
 import h5py
 import numpy as np
@@ -182,6 +187,136 @@ def test_differences_stay_in_the_ranges_and_turn_round_where_the_model_fails(dat
     failing_where(problem, lambda v: v[2] != values[2])
     with pytest.raises(wy.SimulationError, match="too stiff"):
         problem.jacobian(values, residuals)
+
+
+def moved(stiffness, until=24):
+    """5 × 5 of soft yarns, which a step resolves; corners that go to and fro, and a node that is pulled in turns."""
+    yarns = [dataclasses.replace(yarn, stretch=1e-3 * yarn.stretch) for yarn in SCENE.cloth.yarns]
+    cloth = wy.Cloth(wy.Weave.plain(rows=5, columns=5), yarns=yarns)
+    pins = cloth.corners("top")
+    k = np.arange(1, until + 1)[:, None]
+    path = cloth.position[pins] + 2e-4 * np.sin(0.5 * k)[..., None] * [[1.0, 0.5, 0.0], [0.0, 1.0, 0.5]]
+    forces = {22: 2e-5 * np.cos(0.7 * k) * [0.0, 1.0, 0.0], 12: [1e-5, 0.0, 0.0]}
+    return wy.Scene(cloth, pins=pins, pin_stiffness=stiffness, pin_path=path, forces=forces)
+
+
+@pytest.mark.parametrize("stiffness", [None, 1e4])
+def test_paths_begin_with_the_frame_that_learning_begins_with(stiffness):
+    scene = moved(stiffness)
+    data = motion(scene, 24)
+    for first, every in ((8, 1), (0, 1), (9, 3), (22, 1)):
+        problem = task(data, [SHEAR], scene, first=first, every=every, step=1e-3)
+        # the same steps from the same state, to the last bit
+        assert problem.loss(truth(problem)) == 0.0
+        again = problem.trajectory(truth(problem))
+        np.testing.assert_array_equal(again.position, data.position[first::every][: len(again)])
+    # after the last row pins stay, and the force that ends is 0
+    longer = motion(scene, 30)
+    problem = task(longer, [SHEAR], scene, first=20)
+    assert problem.loss(truth(problem)) == 0.0
+    assert problem.trajectory(truth(problem), 12).position[:11] == pytest.approx(longer.position[20:], abs=0.0)
+
+
+@pytest.mark.parametrize("stiffness", [None, 1e4])
+def test_the_same_paths_in_other_steps_leave_the_steps_error_alone(stiffness):
+    scene, options = moved(stiffness), {"integrator": "sdirk2"}
+    # what the scene means: pins that move linearly, forces of a row each
+    start = scene.cloth.position[scene.pins]
+    fine = motion(wl.with_paths(scene, start, 0, Fraction(1, 32), 24 * 32), 24 * 32, 1e-3 / 32, **options)
+    data = dataclasses.replace(fine, step=1e-3, **{name: getattr(fine, name)[::32] for name in FIELDS})
+    moves = np.linalg.norm(data.position[9:] - data.position[8], axis=2)
+
+    def away(n):
+        problem = task(data, [SHEAR], scene, first=8, step=1e-3 / n, **options)
+        return np.sqrt(problem.loss(truth(problem)))
+
+    distances = [away(n) for n in (1, 2, 4)]
+    assert distances[0] < 0.05 * np.sqrt(np.mean(moves**2))
+    # a half of the step has at most a half of its error: springs of moving pins are of order 1
+    assert distances[1] < 0.55 * distances[0] and distances[2] < 0.55 * distances[1]
+    # and the run with half the step, which tells learning the step's error, is the one with half the step
+    problem = task(data, [SHEAR], scene, first=8, step=1e-3, **options)
+    finer = problem.trajectory(truth(problem), refine=2)
+    np.testing.assert_array_equal(finer.position, problem.halved().trajectory(truth(problem)).position)
+    assert np.sqrt(np.mean((finer.position[1:] - data.position[9:]) ** 2) * 3.0) == pytest.approx(distances[1])
+
+
+def test_paths_in_steps_of_another_length():
+    scene = moved(None, until=6)
+    start, path = scene.cloth.position[scene.pins], scene.pin_path
+    force = scene.force_path[:, 0]
+
+    def of(first, ratio, steps):
+        result = wl.with_paths(scene, start, first, Fraction(ratio), steps)
+        return result.pin_path, result.force_path[:, 0]
+
+    pins, forces = of(0, "1/2", 14)
+    np.testing.assert_allclose(pins[0], 0.5 * (start + path[0]), rtol=1e-14)
+    np.testing.assert_array_equal(pins[1:12:2], path)
+    np.testing.assert_array_equal(pins[12:], [path[-1], path[-1]])
+    np.testing.assert_array_equal(forces, [*np.repeat(force[:6], 2, axis=0), *np.zeros((3, 3))])
+    # steps of one and a half rows from row 2 on: 2 and half of 3, half of 3 and 4, 5 and half of none
+    pins, forces = of(2, "3/2", 3)
+    np.testing.assert_allclose(pins, [0.5 * (path[2] + path[3]), path[4], path[5]], rtol=1e-14)
+    expected = [2.0 * force[2] + force[3], force[3] + 2.0 * force[4], 2.0 * force[5]]
+    np.testing.assert_allclose(forces[:3], np.array(expected) / 3.0, atol=1e-18)
+    # the other node's force never ends, and the scene is what it was
+    assert (wl.with_paths(scene, start, 2, Fraction(1, 3), 60).force_path[:, 1] == [1e-5, 0.0, 0.0]).all()
+    assert scene.pin_path is path and len(scene.force_path) == 7
+
+
+def test_shear_is_learned_from_the_middle_of_a_motion_with_paths():
+    scene = moved(None)
+    problem = task(motion(scene, 24), [SHEAR], scene, first=8)
+    result = learn(problem)
+    assert result.values["shear"] == pytest.approx(1000.0, rel=1e-3)
+    assert result.task is problem and result.step_share < 1e-3
+
+
+def test_tasks_and_results_go_to_another_process_and_back(data):
+    problem = task(data)
+    for made in (copy.deepcopy(problem), pickle.loads(pickle.dumps(problem))):
+        assert made.loss(problem.start) == problem.loss(problem.start)
+    here = learn(task(data))
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        there = pool.submit(learn, problem).result()
+        assert there.values == here.values and there.uncertainty == here.uncertainty
+        assert there.task.loss(problem.start) == problem.loss(problem.start)
+        # a model too stiff for its step
+        broken = task(data, [Parameter("bend[0]", 1.0, 1e12, 1e12)], max_iterations=1)
+        with pytest.raises(wy.SimulationError) as caught:
+            pool.submit(learn, broken).result()
+        assert caught.value.step == 1 and caught.value.iterations == []
+        with pytest.raises(wy.InputError, match="iterations = -1"):
+            pool.submit(learn, problem, iterations=-1).result()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_what_ends_learning_has_what_was_learned(data, tmp_path, monkeypatch, error):
+    """At every run of it: the iterations until then, and a checkpoint to go on from."""
+    uninterrupted = learn(task(data))
+    real, path = Task.residuals, tmp_path / "checkpoint.npz"
+    # all but the two that tell the step's error, and the gradient's
+    for stop in range(1, uninterrupted.simulations - 2):
+        problem = task(data)
+
+        def residuals(self, values, stop=stop):
+            if self.simulations == stop - 1:
+                raise error
+            return real(self, values)
+
+        path.unlink(missing_ok=True)
+        with monkeypatch.context() as patch, pytest.raises(error) as caught:
+            patch.setattr(Task, "residuals", residuals)
+            learn(problem, checkpoint=path)
+        done = caught.value.iterations
+        before = [i for i in uninterrupted.history if i.simulations < stop]
+        assert [i.loss for i in done] == [i.loss for i in before]
+        assert path.exists() == (stop > 1)
+        # the same task, as it was left
+        resumed = learn(problem, checkpoint=path)
+        assert resumed.values == uninterrupted.values and resumed.uncertainty == uninterrupted.uncertainty
 
 
 # -- the search -------------------------------------------------------------------------------------------------------

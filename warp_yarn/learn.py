@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
+import itertools
+import math
 import os
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +144,39 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
     return result
 
 
+def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, steps: int) -> Scene:
+    """Give a scene the rows of ``pin_path`` and ``forces`` that a model needs whose steps are not the scene's rows.
+
+    Row k of a path is of the time from k to k + 1, in rows. The model's step j is of the time from first + j ratio to
+    first + (j + 1) ratio. Pins move linearly from row to row, and a force is its mean over the model's step: the motion
+    of the pins and the impulse of the forces are the same with every step.
+
+    Args:
+        scene: the scene, left as it is.
+        start: where the pins are at time 0, before their first row [pins, 3] (m).
+        first: row that the model's first step begins with.
+        ratio: the model's step in rows.
+        steps: how many it makes.
+    """
+    result = copy.copy(scene)
+    # as integers over the denominator, so that times of rows are hit exactly
+    times = np.array([first * ratio.denominator + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
+    if scene.pin_path is not None:
+        places = np.concatenate([start[None], scene.pin_path]).reshape(len(scene.pin_path) + 1, -1)
+        rows = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
+        result.pin_path = np.stack(rows, axis=1).reshape(steps, -1, 3)
+    if len(scene.force_path) > 1:
+        last = len(scene.force_path) - 1
+        path = np.empty((steps + 1, *scene.force_path.shape[1:]))
+        for j, (begin, end) in enumerate(itertools.pairwise(times)):
+            rows = np.arange(math.floor(begin), math.ceil(end))
+            share = (np.minimum(rows + 1, end) - np.maximum(rows, begin)) / (end - begin)
+            path[j] = np.tensordot(share, scene.force_path[np.minimum(rows, last)], axes=1)
+        path[-1] = scene.force_path[-1]
+        result.force_path = path
+    return result
+
+
 # -- the problem ------------------------------------------------------------------------------------------------------
 
 DIFFERENCE = 1e-4
@@ -153,6 +190,13 @@ class Task:
     The model starts in the state of one of the frames (positions, velocities, (u, v), friction's anchors), and its
     positions are compared with those of the frames after it. Methods take the values of the parameters, in their units
     and in their order, as an array [parameters].
+
+    ``pin_path`` and ``forces`` of the scene go by the target's frames, whatever the model's step: row k is of the time
+    from frame k to frame k + 1, so that learning from frame ``first`` on begins with row ``first``. In steps of another
+    length pins move linearly from row to row (to row 0 from where frame 0 has them), and a force is its mean over the
+    step: that of the row where the step lies in one.
+
+    A task can be copied, pickled and sent to another process, and so can a ``Result``; its rollout is made there anew.
 
     Args:
         scene: the model; what is not learned keeps its values.
@@ -168,6 +212,7 @@ class Task:
         initial: the state that the model starts in.
         positions: what it is compared with [frames, nodes, 3] (m).
         step: its step [s].
+        rollout: of the scene with its own values, of the model's step.
         cost: how many runs one of its runs counts as: 1, or so many times as its step was halved, in powers of 2.
         simulations: runs made so far, those that gradients begin with among them.
         gradients: backward runs made so far.
@@ -195,6 +240,8 @@ class Task:
         self.initial = target[int(chosen[0])]
         self.positions = target.position[chosen[1:]].copy()
         self.frame_time = target.step * every
+        self._first, self._every = first, every
+        self._pins_at_start = target.position[0, scene.pins].copy()
         self._state = {name: torch.as_tensor(getattr(self.initial, name)) for name in FIELDS}
         self._prepare(1 if step is None else self._steps_per_frame(number("step", step, above=0.0)))
         self.cost = 1
@@ -203,9 +250,23 @@ class Task:
     def _prepare(self, steps_per_frame: int) -> None:
         """Settles the step, and with it the rollout."""
         self.steps_per_frame, self.step = steps_per_frame, self.frame_time / steps_per_frame
-        after = np.arange(1, len(self.positions) + 1) * steps_per_frame
-        self.rollout = Rollout(self.scene, int(after[-1]), frames=after, step=self.step, **self.options)
+        self.__dict__.pop("rollout", None)
         self.rollout.simulator.state = self.initial  # to have it checked
+
+    @functools.cached_property
+    def rollout(self) -> Rollout:
+        after = np.arange(1, len(self.positions) + 1) * self.steps_per_frame
+        scene = self._in_steps(self.scene, self.steps_per_frame, len(self.positions))
+        return Rollout(scene, int(after[-1]), frames=after, step=self.step, **self.options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # what is on the device stays there
+        return {name: value for name, value in self.__dict__.items() if name != "rollout"}
+
+    def _in_steps(self, scene: Scene, steps_per_frame: int, frames: int) -> Scene:
+        """A scene whose paths go by the model's steps."""
+        ratio = Fraction(self._every, steps_per_frame)
+        return with_paths(scene, self._pins_at_start, self._first, ratio, steps_per_frame * frames)
 
     def halved(self) -> Task:
         """The same task for a model of half the step, with the runs that this one has made."""
@@ -348,7 +409,7 @@ class Task:
         every = self.steps_per_frame * whole("refine", refine, least=1)
         # The kernels that learning has compiled, though nothing is differentiated.
         options = {**self.options, "step": self.frame_time / every, "differentiable": True}
-        simulator = Simulator(self.scene_with(values), **options)
+        simulator = Simulator(self._in_steps(self.scene_with(values), every, count), **options)
         simulator.state = self.initial
         motion = simulator.run(count * every)
         parts = {name: getattr(motion, name)[::every] for name in FIELDS}
@@ -464,26 +525,42 @@ def learn(
         halvings: how many times the model's step may be halved. It is where it leaves a value less sure than KNOWN, as
             far as its error stands in the residuals (``Result.step_share``), and where a model of half the step, with
             values without the step's part, is nearer to the data. Those of the model's own step and method are not.
-        checkpoint: a file, ending in .npz, that is written after every iteration. Where it is there already, learning
-            goes on from it, and ends where it would have ended without the interruption.
+        checkpoint: a file, ending in .npz, that is written at the start and after every iteration. Where it is there
+            already, learning goes on from it, and ends where it would have ended without the interruption.
         progress: show a bar with the loss and the values, on a terminal.
         watch: called after every iteration.
 
     Raises:
         InputError: an argument out of its range, or a checkpoint of another task.
-        SimulationError: the model cannot be simulated with the start values. A later step to such values is shortened.
+        SimulationError: the model cannot be simulated with the start values, or not on either side of later ones. A
+            step to such values is shortened.
+
+    Every exception, KeyboardInterrupt too, has the iterations until then as ``iterations`` [list of Iteration]: the
+    last one's values are the best so far.
     """
     whole("iterations", iterations, least=0)
     search = _Search(task, number("resolution", resolution, above=0.0), whole("halvings", halvings, least=0))
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.suffix != ".npz":
         raise InputError(f"checkpoint = {str(checkpoint)!r}, must end in .npz")
+    try:
+        return _iterate(search, iterations, path, progress, watch)
+    except BaseException as error:
+        error.iterations = list(search.history)
+        raise
+
+
+def _iterate(
+    search: _Search, iterations: int, path: Path | None, progress: bool, watch: Callable[[Iteration], None]
+) -> Result:
     # The first run compiles the kernels where they changed, which takes many seconds, and says so meanwhile.
     with tqdm.tqdm(desc="compiling", bar_format=BAR, disable=None if progress else True) as bar:
         if path is not None and path.exists():
             search.load(path)
         else:
             search.begin()
+            if path is not None:
+                search.save(path)
         watch(search.history[-1])
         bar.set_description("learning", refresh=False)
         ended = None
