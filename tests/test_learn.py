@@ -153,7 +153,8 @@ def test_gradient_and_jacobian_agree_with_differences_of_the_loss(data):
     np.testing.assert_allclose(gradient * width / scale, np.array(differences) / 2e-4 / scale, atol=1e-7)
     np.testing.assert_allclose(2.0 * jacobian.T @ residuals / scale, gradient * width / scale, atol=1e-3)
     assert np.abs(gradient * width / scale).max() > 0.1  # or all of it could be 0
-    assert (problem.simulations, problem.gradients) == (1 + 1 + 1 + 7 + 14, 1)
+    # of the Jacobian, one shows what the solver leaves
+    assert (problem.simulations, problem.gradients) == (1 + 1 + 1 + 8 + 14, 1)
 
 
 def failing_where(problem, fails):
@@ -294,11 +295,20 @@ def test_tasks_and_results_go_to_another_process_and_back(data):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
 def test_what_ends_learning_has_what_was_learned(data, tmp_path, monkeypatch, error):
-    """At every run of it: the iterations until then, and a checkpoint to go on from."""
+    """The iterations until then, and a checkpoint to go on from."""
     uninterrupted = learn(task(data))
     real, path = Task.residuals, tmp_path / "checkpoint.npz"
-    # all but the two that tell the step's error, and the gradient's
-    for stop in range(1, uninterrupted.simulations - 2):
+    runs = []
+
+    def counted(self, values):
+        runs.append(self.simulations)
+        return real(self, values)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Task, "residuals", counted)
+        learn(task(data))
+    # the first run, in the first Jacobian, before and after a step, in the last Jacobian
+    for stop in [runs[k] + 1 for k in (0, 1, 3, 5, 6, -1)]:
         problem = task(data)
 
         def residuals(self, values, stop=stop):
@@ -341,9 +351,11 @@ def test_the_papers_parameters_are_learned_from_eight_frames():
     assert result.loss == pytest.approx(problem.loss(np.array(list(result.values.values()))), rel=1e-12)
     # Differences at the start alone, and for the uncertainties: Broyden's updates do for what is between.
     steps = [i.simulations for i in result.history]
-    assert steps == [1, *range(len(PAPER) + 2, len(PAPER) + len(steps) + 1)]
+    # Beside the eight, one shows what the solver leaves, and three look for what friction does.
+    jacobian = len(PAPER) + 1 + 3
+    assert steps == [1, *range(jacobian + 2, jacobian + len(steps) + 1)]
     # The step's error counts as two, the gradient as one.
-    assert (result.simulations, result.gradients) == (steps[-1] + len(PAPER) + 2 + 1, 1)
+    assert (result.simulations, result.gradients) == (steps[-1] + jacobian + 2 + 1, 1)
     assert len(steps) <= 8  # 7; without the updates it takes 11
     assert np.diff([i.loss for i in result.history]).max() < 0.0
 
@@ -391,15 +403,15 @@ def test_a_truth_outside_the_range_ends_on_its_bound(data):
 @pytest.mark.parametrize("worse", [False, True])
 def test_a_trial_that_fails_or_is_worse_was_a_step_too_long(data, worse):
     problem = task(data)
-    # The start, three differences, and the first trial.
-    asked = failing_where(problem, lambda values: len(asked) == 5 and not worse)
+    # The start, four runs of the Jacobian, and the first trial.
+    asked = failing_where(problem, lambda values: len(asked) == 6 and not worse)
     if worse:
         right = problem.residuals
-        problem.residuals = lambda values: right(values) * (10.0 if len(asked) == 5 else 1.0)
+        problem.residuals = lambda values: right(values) * (10.0 if len(asked) == 6 else 1.0)
     result = learn(problem)
-    first, second = (np.linalg.norm((v - problem.start) / (problem.high - problem.low)) for v in asked[4:6])
+    first, second = (np.linalg.norm((v - problem.start) / (problem.high - problem.low)) for v in asked[5:7])
     assert 0.0 < second < first
-    np.testing.assert_allclose(result.history[1].values, asked[5])
+    np.testing.assert_allclose(result.history[1].values, asked[6])
     np.testing.assert_allclose(list(result.values.values()), truth(problem), rtol=1e-3)
 
 

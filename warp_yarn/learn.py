@@ -180,8 +180,16 @@ def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, ste
 # -- the problem ------------------------------------------------------------------------------------------------------
 
 DIFFERENCE = 1e-4
-"""Width of differences of runs [ranges]: curvature adds some 1e-4 of a derivative to it, and what the solver leaves of
-runs, some 1e-8 of the motion, no more."""
+"""Width of differences of runs [ranges]: curvature adds some 1e-4 of a derivative to it."""
+
+WIDEST = 0.1
+"""Where differences of that width drown in what the solver leaves of runs, they are taken so wide at most [ranges]."""
+
+TINY = 1e-8
+"""A change of all values that changes little but what the solver leaves [ranges]."""
+
+CLEAR, SEEN = 30.0, 3.0
+"""A change of residuals that is clear, and one that is seen at all: so many times what the solver leaves in them."""
 
 
 class Task:
@@ -273,6 +281,17 @@ class Task:
         result = copy.copy(self)
         result._prepare(2 * self.steps_per_frame)
         result.cost = 2 * self.cost
+        return result
+
+    def held(self, k: int, values: np.ndarray) -> Task:
+        """The same task without parameter k, which has its value of these; the others start with theirs."""
+        result = copy.copy(self)
+        result.scene = with_values(self.scene, {self.names[k]: values[k]})
+        kept = [j for j in range(len(values)) if j != k]
+        result.parameters = tuple(dataclasses.replace(self.parameters[j], start=values[j]) for j in kept)
+        result.names = [self.names[j] for j in kept]
+        result.low, result.high, result.start = self.low[kept], self.high[kept], values[kept]
+        result._prepare(self.steps_per_frame)
         return result
 
     def _check_parameters(self) -> None:
@@ -369,7 +388,10 @@ class Task:
         return float(loss.detach()), np.array([float(part if k is None else part[k]) for part, k in parts])
 
     def jacobian(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """∂residuals/∂y [residuals, parameters], y = (value − low)/(high − low), by differences: a run a parameter.
+        """∂residuals/∂y [residuals, parameters], y = (value − low)/(high − low), by differences.
+
+        A run a parameter, and one that shows what the solver leaves: from that, differences are wider where they would
+        be too small to be seen (``CLEAR``), and 0 where the widest are not seen either.
 
         Args:
             values: where.
@@ -378,22 +400,32 @@ class Task:
         Raises:
             SimulationError: the model can be simulated on neither side.
         """
-        columns = []
-        for k, value in enumerate(values):
-            middle, width = 0.5 * (self.low[k] + self.high[k]), self.high[k] - self.low[k]
-            change = DIFFERENCE if value < middle else -DIFFERENCE
-            moved = values.copy()
+        inwards = np.where(values < 0.5 * (self.low + self.high), 1.0, -1.0)
+        moves = np.diag(inwards)
+        columns = [self._difference(values, residuals, DIFFERENCE, move) for move in moves]
+        tiny = self._difference(values, residuals, TINY, inwards)
+        left = TINY * float(np.linalg.norm(tiny - np.sum(columns, axis=0)))
+        for k, move in enumerate(moves):
+            width = DIFFERENCE
             try:
-                moved[k] = value + change * width
-                column = self.residuals(moved)
-            except SimulationError:
-                change = -change
-                moved[k] = value + change * width
-                if not self.low[k] <= moved[k] <= self.high[k]:
-                    raise
-                column = self.residuals(moved)
-            columns.append((column - residuals) / change)
-        return np.stack(columns, axis=1)
+                while width * np.linalg.norm(columns[k]) < CLEAR * left and width < WIDEST:
+                    width = min(10.0 * width, WIDEST)
+                    columns[k] = self._difference(values, residuals, width, move)
+            except SimulationError:  # so wide, it fails: the last one is what there is
+                pass
+            if width * np.linalg.norm(columns[k]) < SEEN * left:
+                columns[k] = np.zeros_like(residuals)
+        return np.stack(columns, axis=1) * inwards
+
+    def _difference(self, values: np.ndarray, residuals: np.ndarray, width: float, move: np.ndarray) -> np.ndarray:
+        """(r(y + width · move) − r(y))/width, with −width where the model fails and values stay in their ranges."""
+        change = width * move * (self.high - self.low)
+        try:
+            return (self.residuals(values + change) - residuals) / width
+        except SimulationError:
+            if np.any(values - change < self.low) or np.any(values - change > self.high):
+                raise
+            return (self.residuals(values - change) - residuals) / -width
 
     def trajectory(self, values: np.ndarray, frames: int | None = None, *, refine: int = 1) -> Trajectory:
         """The model's motion with these values: the initial state, and frames as far apart as those compared.
@@ -433,8 +465,17 @@ KNOWN = 0.015
 LESS = 0.9
 """What must be left of a standard deviation, as far as can be foreseen, for a shorter step to be worth its runs."""
 
-DETERMINED = 0.5 / np.sqrt(12.0)
+UNKNOWN = 1.0 / np.sqrt(12.0)
+"""Standard deviation of a uniform distribution over a range [ranges]."""
+
+DETERMINED = 0.5 * UNKNOWN
 """Standard deviation below which the data determine a parameter [ranges]: half of what the range alone says."""
+
+SUSPECT = 0.1
+"""Part of the step's error of unknown shape above which other values are looked for that are as good."""
+
+PROBING = 5
+"""Iterations in which other values are to show that they are as good (``_Search._probes``)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -584,17 +625,23 @@ class _Answer:
 
     Args:
         covariance: of the values, as far as the residuals tell [p, p].
-        deviation: standard deviations, the step's error included [p].
+        of_data: standard deviations without the known part of the step's error [p].
+        deviation: standard deviations, all of the step's error included [p].
         without_step: what they would be without the part of the residuals that the step explains [p].
         step_error: the part of the values that is due to the step [p].
         share: of the step's error that the data are without.
+        unexplained: part of the step's error that is of unknown shape, from 0 to 1.
+        moved: by how much that changes the model [m].
     """
 
     covariance: np.ndarray
+    of_data: np.ndarray
     deviation: np.ndarray
     without_step: np.ndarray
     step_error: np.ndarray
     share: float
+    unexplained: float
+    moved: float
 
 
 class _Search:
@@ -784,27 +831,84 @@ class _Search:
 
     # -- the answer --------------------------------------------------------------------------------------------------
 
-    def _answer(self) -> _Answer:
-        """What the data leave open here."""
-        shift, rest, share = step_errors(self.jacobian, self.residuals, self._missed_by_the_step(), self.resolution)
+    def _answer(self, others: Sequence[np.ndarray] = ()) -> _Answer:
+        """What the data leave open here; with other values that may be the true ones."""
+        missed = self._missed_by_the_step(self.values, self.residuals)
+        shift, rest, share = step_errors(self.jacobian, self.residuals, missed, self.resolution)
+        left = self.residuals + share * rest
 
-        def covariance(residuals: np.ndarray) -> np.ndarray:
-            return uncertainties(self.jacobian, residual_variance(self._field(residuals), len(self.y), self.resolution))
+        def variance(residuals: np.ndarray) -> float:
+            return residual_variance(self._field(residuals), len(self.y), self.resolution)
 
         # Of all that is left, not of what the step does not explain: where the step is too long for its error to be one
         # of first order, that would be too sure (stretch[1] of 5 × 5: 11 % off with 0.6 %).
-        own = covariance(self.residuals)
+        of_residuals = variance(self.residuals)
+        unexplained = unexplained_part(self._field(rest), self._field(left))
+        moved = unexplained * float(np.linalg.norm(missed))
+        of_step = moved**2 / independent(self._field(missed))
+        own = uncertainties(self.jacobian, of_residuals + of_step)
         of_data = np.sqrt(np.diag(own))
-        step_error = np.where(of_data < DETERMINED, share * shift, 0.0)
-        without_step = np.sqrt(np.diag(covariance(self.residuals + share * rest)))
-        return _Answer(own, np.hypot(of_data, step_error), without_step, step_error, share)
+        # a motion that differs by no more than the step's error may be the true one
+        alike = [i.values for i in self.history if i.loss - self.loss <= moved**2]
+        for values in (*alike, *others):
+            of_data = np.maximum(of_data, np.abs(values - self.values) / (self.task.high - self.task.low))
+        of_data = np.minimum(of_data, UNKNOWN)
+        determined = of_data < DETERMINED
+        # noise makes a share where there is none
+        spread = min(1.0, float(np.sqrt(of_residuals / max(rest @ rest, np.finfo(float).tiny))))
+        step_error = np.where(determined, share * shift, 0.0)
+        deviation = np.hypot(of_data, np.where(determined, np.hypot(share, spread) * shift, 0.0))
+        without_step = np.sqrt(np.diag(uncertainties(self.jacobian, variance(left))))
+        return _Answer(own, of_data, deviation, without_step, step_error, share, unexplained, moved)
+
+    def _probes(self, answer: _Answer) -> list[np.ndarray]:
+        """Other values that may be the true ones as far as the step's error goes, where the model is not linear.
+
+        Each determined parameter is moved by three standard deviations, to where it has more room, and the others are
+        learned anew. Where the model is as near then as its step's error allows, here or there, three times as far.
+        """
+        found: list[np.ndarray] = []
+        for k, deviation in enumerate(answer.of_data):
+            along, reach = answer.covariance[:, k] / answer.covariance[k, k], 3.0 * deviation
+            while deviation < DETERMINED:
+                move = min(reach, 0.5) * (1.0 if self.y[k] < 0.5 else -1.0)
+                start = np.clip(self.y + move * along, 0.0, 1.0)
+                start[k] = self.y[k] + move
+                probe = self._probe(k, self._physical(start), answer)
+                if probe is None:
+                    break
+                found.append(probe)
+                deviation, reach = abs(move), 3.0 * reach
+        return found
+
+    def _probe(self, k: int, values: np.ndarray, answer: _Answer) -> np.ndarray | None:
+        """Values that may be the true ones, found in a few iterations from these with k held; None: there are none."""
+        task, enough = self.task, self.loss + answer.moved**2
+        try:
+            residuals = task.residuals(values)
+            if residuals @ residuals > enough and len(values) > 1:
+                other = _Search(task.held(k, values), self.resolution, halvings=0)
+                other.begin()
+                while other.loss > enough and len(other.history) <= PROBING and other.advance() is None:
+                    pass
+                task.simulations = other.task.simulations
+                values, residuals = np.insert(other.values, k, values[k]), other.residuals
+            more = residuals @ residuals - enough
+            if more > 0.0:
+                missed = self._missed_by_the_step(values, residuals)
+                more = residuals @ residuals - self.loss - answer.unexplained**2 * (missed @ missed)
+        except SimulationError:
+            return None
+        return None if more > 0.0 else values
 
     def result(self, ended: str) -> Result:
         task, width = self.task, self.task.high - self.task.low
         if not self.fresh:
             self._differentiate()
         answer = self._answer()
-        of_data = np.sqrt(np.diag(answer.covariance))
+        if answer.unexplained > SUSPECT:
+            answer = self._answer(self._probes(answer))
+        of_residuals = np.sqrt(np.diag(answer.covariance))
         try:
             _, gradient = task.loss_and_gradient(self.values)
         except GradientError:  # of steps that could only be made in parts
@@ -820,8 +924,8 @@ class _Search:
             uncertainty=by_name(answer.deviation * width),
             step_error=by_name(answer.step_error * width),
             step_share=answer.share,
-            status={name: _status(*of) for name, *of in zip(task.names, self.y, of_data, strict=True)},
-            correlation=answer.covariance / np.outer(of_data, of_data),
+            status={name: _status(*of) for name, *of in zip(task.names, self.y, answer.of_data, strict=True)},
+            correlation=answer.covariance / np.outer(of_residuals, of_residuals),
             loss=self.loss,
             gradient=gradient * width,
             history=self.history,
@@ -836,17 +940,17 @@ class _Search:
         weave = self.task.scene.cloth.weave
         return residuals.reshape(-1, weave.rows, weave.columns, 3)
 
-    def _missed_by_the_step(self) -> np.ndarray:
+    def _missed_by_the_step(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """Estimate of what the residuals at these values would gain if the step went to 0 [residuals]; 0 if unknown."""
         task = self.task
         task.simulations += 2 * task.cost
         try:
-            finer = task.trajectory(self.values, refine=2).position[1:]
+            finer = task.trajectory(values, refine=2).position[1:]
         except SimulationError:
-            return np.zeros(len(self.residuals))
+            return np.zeros(len(residuals))
         offset = (finer - task.positions).ravel() / np.sqrt(len(task.positions) * task.scene.cloth.nodes)
         power = 2.0**task.rollout.simulator.integrator.order
-        return (offset - self.residuals) * power / (power - 1.0)
+        return (offset - residuals) * power / (power - 1.0)
 
 
 _OF_ITERATIONS = tuple(field.name for field in dataclasses.fields(Iteration))
@@ -905,14 +1009,31 @@ def step_errors(
     return shift, rest, float(share)
 
 
+def unexplained_part(rest: np.ndarray, left: np.ndarray) -> float:
+    """How much of the step's error, from 0 to 1, the values may have taken in without its being known how.
+
+    ``step_errors`` goes by the shape of e, which is that of the error only where the step resolves the motion. A
+    pattern in what that leaves of the residuals may be the step's error in another shape: as much of it as the pattern
+    is of the part of e that the values could not take in. Noise has no pattern.
+
+    Args:
+        rest: e − J A e [frames, rows, columns, 3] (m).
+        left: the residuals without what the step explains, likewise.
+    """
+    pattern = np.linalg.norm(left) * np.sqrt(max(0.0, 1.0 - independent(left) / left.size))
+    return float(min(1.0, pattern / max(np.linalg.norm(rest), np.finfo(float).tiny)))
+
+
 def independent(residuals: np.ndarray) -> float:
     """How many of these residuals [frames, rows, columns, 3] are independent, at the least.
 
     What is learned is a weighted sum of residuals, and the variance of one whose weights have the norm 1 is at most the
     largest eigenvalue λ of their correlation, which is 1 where they are independent. So n along an axis count as n/λ,
     with the correlation along it as the other axes show it: as 1 where all are alike, and as 1 or 2 where they
-    oscillate, though neighbours differ then. In N samples of noise λ is up to some (1 + √(n/N))² (Marchenko and
-    Pastur): what is below counts as 1. N counts samples that may be alike too, which errs to the safe side.
+    oscillate, though neighbours differ then. In N samples of noise λ is some (1 + √(n/N))² (Marchenko and Pastur), in
+    one case of a thousand it is more than that and 3.27 of its widths (Johnstone, "On the distribution of the largest
+    eigenvalue in principal components analysis", 2001): what is below counts as 1. N counts samples that may be alike
+    too, which errs to the safe side.
     """
     result = float(residuals.shape[3])
     for axis in range(3):
@@ -921,6 +1042,8 @@ def independent(residuals: np.ndarray) -> float:
         covariance = along @ along.T
         mean = np.trace(covariance) / n
         largest = np.linalg.eigvalsh(covariance)[-1]
-        of_noise = (1.0 + np.sqrt(n / along.shape[1])) ** 2
+        size = np.sqrt(along.shape[1]) + np.sqrt(n)
+        width = size * (1.0 / np.sqrt(along.shape[1]) + 1.0 / np.sqrt(n)) ** (1.0 / 3.0)
+        of_noise = (size**2 + 3.27 * width) / along.shape[1]
         result *= n * mean / largest if largest > of_noise * mean else n
     return result
