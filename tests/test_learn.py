@@ -351,8 +351,8 @@ def test_the_papers_parameters_are_learned_from_eight_frames():
     assert result.loss == pytest.approx(problem.loss(np.array(list(result.values.values()))), rel=1e-12)
     # Differences at the start alone, and for the uncertainties: Broyden's updates do for what is between.
     steps = [i.simulations for i in result.history]
-    # Beside the eight, one shows what the solver leaves, and three look for what friction does.
-    jacobian = len(PAPER) + 1 + 3
+    # Beside the eight, one shows what the solver leaves, and two look for what friction does.
+    jacobian = len(PAPER) + 1 + 2
     assert steps == [1, *range(jacobian + 2, jacobian + len(steps) + 1)]
     # The step's error counts as two, the gradient as one.
     assert (result.simulations, result.gradients) == (steps[-1] + jacobian + 2 + 1, 1)

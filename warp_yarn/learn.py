@@ -182,14 +182,23 @@ def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, ste
 DIFFERENCE = 1e-4
 """Width of differences of runs [ranges]: curvature adds some 1e-4 of a derivative to it."""
 
-WIDEST = 0.1
-"""Where differences of that width drown in what the solver leaves of runs, they are taken so wide at most [ranges]."""
+WIDER, WIDEST = 30.0, 0.1
+"""Where differences may be what the solver leaves of runs, and do not agree with their neighbours, they are taken so
+many times as wide, and so wide at most [ranges]."""
+
+SOLVED = 1e-10
+"""``newton_tolerance`` of runs in double precision. What 1e-8, that of gradients, leaves of runs of light, stiff yarns
+is as large as what small changes of some parameters make, and a search finds no way through it."""
 
 TINY = 1e-8
 """A change of all values that changes little but what the solver leaves [ranges]."""
 
-CLEAR, SEEN = 30.0, 3.0
-"""A change of residuals that is clear, and one that is seen at all: so many times what the solver leaves in them."""
+CLEAR = 30.0
+"""A change of residuals that is so many times what one run shows that the solver leaves is a change."""
+
+SURE = 1e-6
+"""So is one that is this part of the nodes' paths: the solver sometimes leaves much more than one run shows, some 4e-7
+of the path of light, stiff yarns."""
 
 
 class Task:
@@ -214,11 +223,12 @@ class Task:
         first: the frame to start from.
         every: take only every so many-th frame after it (10: data at 0.1 ms as frames of 1 ms).
         step: h of the model [s]; the time between compared frames must be a whole multiple of it. None: that time.
-        options: of the Simulator: integrator, tolerance, device, ...
+        options: of the Simulator: integrator, tolerance, device, ... ``newton_tolerance`` is 1e-10 in double precision.
 
     Attributes:
         initial: the state that the model starts in.
         positions: what it is compared with [frames, nodes, 3] (m).
+        path: length of the nodes' paths from frame to frame, root mean square [m].
         step: its step [s].
         rollout: of the scene with its own values, of the model's step.
         cost: how many runs one of its runs counts as: 1, or so many times as its step was halved, in powers of 2.
@@ -239,6 +249,8 @@ class Task:
         **options: Any,
     ):
         self.scene, self.parameters, self.options = scene, tuple(parameters), options
+        if options.get("precision", "double") == "double":
+            options.setdefault("newton_tolerance", SOLVED)
         self.names = [p.name for p in self.parameters]
         self.low, self.high, self.start = (
             np.array([getattr(p, end) for p in self.parameters], dtype=np.float64) for end in ("low", "high", "start")
@@ -249,6 +261,8 @@ class Task:
         self.positions = target.position[chosen[1:]].copy()
         self.frame_time = target.step * every
         self._first, self._every = first, every
+        paths = np.diff(target.position[chosen], axis=0)
+        self.path = float(np.sqrt(np.mean(np.linalg.norm(paths, axis=2).sum(axis=0) ** 2)))
         self._pins_at_start = target.position[0, scene.pins].copy()
         self._state = {name: torch.as_tensor(getattr(self.initial, name)) for name in FIELDS}
         self._prepare(1 if step is None else self._steps_per_frame(number("step", step, above=0.0)))
@@ -390,8 +404,8 @@ class Task:
     def jacobian(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """∂residuals/∂y [residuals, parameters], y = (value − low)/(high − low), by differences.
 
-        A run a parameter, and one that shows what the solver leaves: from that, differences are wider where they would
-        be too small to be seen (``CLEAR``), and 0 where the widest are not seen either.
+        A run a parameter, and one that shows what the solver leaves. A difference that may be no more than that is
+        compared with one from there on, and taken wider until the two agree; 0 where the widest have nothing in common.
 
         Args:
             values: where.
@@ -406,16 +420,29 @@ class Task:
         tiny = self._difference(values, residuals, TINY, inwards)
         left = TINY * float(np.linalg.norm(tiny - np.sum(columns, axis=0)))
         for k, move in enumerate(moves):
-            width = DIFFERENCE
-            try:
-                while width * np.linalg.norm(columns[k]) < CLEAR * left and width < WIDEST:
-                    width = min(10.0 * width, WIDEST)
-                    columns[k] = self._difference(values, residuals, width, move)
-            except SimulationError:  # so wide, it fails: the last one is what there is
-                pass
-            if width * np.linalg.norm(columns[k]) < SEEN * left:
-                columns[k] = np.zeros_like(residuals)
+            if DIFFERENCE * np.linalg.norm(columns[k]) < max(CLEAR * left, SURE * self.path):
+                columns[k] = self._confirmed(values, residuals, columns[k], move)
         return np.stack(columns, axis=1) * inwards
+
+    def _confirmed(self, values: np.ndarray, residuals: np.ndarray, column: np.ndarray, move: np.ndarray) -> np.ndarray:
+        """A difference by ``move`` that another agrees with, beginning with a column of the usual width."""
+        width = DIFFERENCE
+        while True:
+            try:
+                both = self._difference(values, residuals, 2.0 * width, move)
+            except SimulationError:  # so far from here the model fails: what there is must do
+                return column
+            # the other is 2 both − column
+            apart, together = np.linalg.norm(2.0 * (both - column)), np.linalg.norm(2.0 * both)
+            if apart < 0.25 * together:
+                return both
+            if width == WIDEST:
+                return both if apart < together else np.zeros_like(both)
+            width = min(WIDER * width, WIDEST)
+            try:
+                column = self._difference(values, residuals, width, move)
+            except SimulationError:
+                return both
 
     def _difference(self, values: np.ndarray, residuals: np.ndarray, width: float, move: np.ndarray) -> np.ndarray:
         """(r(y + width · move) − r(y))/width, with −width where the model fails and values stay in their ranges."""
