@@ -499,10 +499,13 @@ DETERMINED = 0.5 * UNKNOWN
 """Standard deviation below which the data determine a parameter [ranges]: half of what the range alone says."""
 
 SUSPECT = 0.1
-"""Part of the step's error of unknown shape above which other values are looked for that are as good."""
+"""Part of the step's error of unknown shape above which other values are allowed their own step's error."""
 
-PROBING = 5
-"""Iterations in which other values are to show that they are as good (``_Search._probes``)."""
+LINEAR = (7.0, 11.0)
+"""Variances that the loss rises by within three standard deviations, 9, where the model responds linearly enough."""
+
+PROBING = 10
+"""Iterations in which other values are to show how good they are (``_Search._probed``)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -659,6 +662,7 @@ class _Answer:
         share: of the step's error that the data are without.
         unexplained: part of the step's error that is of unknown shape, from 0 to 1.
         moved: by how much that changes the model [m].
+        variance: of a residual [m²].
     """
 
     covariance: np.ndarray
@@ -669,6 +673,7 @@ class _Answer:
     share: float
     unexplained: float
     moved: float
+    variance: float
 
 
 class _Search:
@@ -788,7 +793,7 @@ class _Search:
         """Goes on with half the model's step, from values without its error, where that is worth it and nearer."""
         if self.task.steps_per_frame == self.most_steps:
             return False
-        now = self._answer()
+        now = self._answer(self._missed_by_the_step(self.values, self.residuals))
         if not np.any((now.deviation > KNOWN) & (now.without_step < LESS * now.deviation)):
             return False
         finer, y = self.task.halved(), np.clip(self.y - now.step_error, 0.0, 1.0)
@@ -858,9 +863,8 @@ class _Search:
 
     # -- the answer --------------------------------------------------------------------------------------------------
 
-    def _answer(self, others: Sequence[np.ndarray] = ()) -> _Answer:
-        """What the data leave open here; with other values that may be the true ones."""
-        missed = self._missed_by_the_step(self.values, self.residuals)
+    def _answer(self, missed: np.ndarray, least: np.ndarray | float = 0.0) -> _Answer:
+        """What the data leave open here, at least so much; ``missed`` is the step's error."""
         shift, rest, share = step_errors(self.jacobian, self.residuals, missed, self.resolution)
         left = self.residuals + share * rest
 
@@ -876,65 +880,81 @@ class _Search:
         own = uncertainties(self.jacobian, of_residuals + of_step)
         of_data = np.sqrt(np.diag(own))
         # a motion that differs by no more than the step's error may be the true one
-        alike = [i.values for i in self.history if i.loss - self.loss <= moved**2]
-        for values in (*alike, *others):
-            of_data = np.maximum(of_data, np.abs(values - self.values) / (self.task.high - self.task.low))
-        of_data = np.minimum(of_data, UNKNOWN)
+        for i in self.history:
+            if i.loss - self.loss <= moved**2:
+                of_data = np.maximum(of_data, np.abs(i.values - self.values) / (self.task.high - self.task.low))
+        of_data = np.minimum(np.maximum(of_data, least), UNKNOWN)
         determined = of_data < DETERMINED
         # noise makes a share where there is none
         spread = min(1.0, float(np.sqrt(of_residuals / max(rest @ rest, np.finfo(float).tiny))))
         step_error = np.where(determined, share * shift, 0.0)
         deviation = np.hypot(of_data, np.where(determined, np.hypot(share, spread) * shift, 0.0))
         without_step = np.sqrt(np.diag(uncertainties(self.jacobian, variance(left))))
-        return _Answer(own, of_data, deviation, without_step, step_error, share, unexplained, moved)
+        return _Answer(own, of_data, deviation, without_step, step_error, share, unexplained, moved, of_residuals)
 
-    def _probes(self, answer: _Answer) -> list[np.ndarray]:
-        """Other values that may be the true ones as far as the step's error goes, where the model is not linear.
+    def _probed(self, answer: _Answer) -> np.ndarray:
+        """Standard deviations of the data as the loss shows them, where the model does not respond linearly [p].
 
-        Each determined parameter is moved by three standard deviations, to where it has more room, and the others are
-        learned anew. Where the model is as near then as its step's error allows, here or there, three times as far.
+        Each determined parameter is moved by three of them, to where it has more room, and the others with it: the loss
+        is to rise by 9 variances of a residual. Where it does not, others are learned anew there, and further away
+        too, as far as half of the range: a rise by n variances tells a deviation of 1/√n of the way.
         """
-        found: list[np.ndarray] = []
+        result = answer.of_data.copy()
         for k, deviation in enumerate(answer.of_data):
-            along, reach = answer.covariance[:, k] / answer.covariance[k, k], 3.0 * deviation
-            while deviation < DETERMINED:
-                move = min(reach, 0.5) * (1.0 if self.y[k] < 0.5 else -1.0)
-                start = np.clip(self.y + move * along, 0.0, 1.0)
+            reach, start = 3.0 * deviation, self.y + 3.0 * deviation * answer.covariance[:, k] / answer.covariance[k, k]
+            side = 1.0 if self.y[k] < 0.5 else -1.0
+            if side < 0.0:
+                start = 2.0 * self.y - start
+            linear = True
+            while result[k] < DETERMINED:
+                move = side * min(reach, 0.5)
+                start = np.clip(start, 0.0, 1.0)
                 start[k] = self.y[k] + move
-                probe = self._probe(k, self._physical(start), answer)
-                if probe is None:
+                rise = self._rise(k, self._physical(start), answer, linear)
+                if linear and LINEAR[0] < rise < LINEAR[1]:
                     break
-                found.append(probe)
-                deviation, reach = abs(move), 3.0 * reach
-        return found
+                result[k] = max(result[k], abs(move) / np.sqrt(max(rise, 1.0)))
+                if reach >= 0.5:
+                    break
+                start = (self.task.start - self.task.low) / (self.task.high - self.task.low)
+                reach, linear = 3.0 * reach, False
+        return result
 
-    def _probe(self, k: int, values: np.ndarray, answer: _Answer) -> np.ndarray | None:
-        """Values that may be the true ones, found in a few iterations from these with k held; None: there are none."""
-        task, enough = self.task, self.loss + answer.moved**2
+    def _rise(self, k: int, values: np.ndarray, answer: _Answer, linear: bool) -> float:
+        """How many variances the loss rises by that the step's error does not allow, near these values with k held.
+
+        Args:
+            linear: whether the rise of a linear model is enough to know.
+        """
+        task = self.task
+
+        def rise(residuals: np.ndarray) -> float:
+            return (residuals @ residuals - self.loss - answer.moved**2) / answer.variance
+
         try:
             residuals = task.residuals(values)
-            if residuals @ residuals > enough and len(values) > 1:
+            if rise(residuals) > 1.0 and not (linear and LINEAR[0] < rise(residuals) < LINEAR[1]) and len(values) > 1:
                 other = _Search(task.held(k, values), self.resolution, halvings=0)
                 other.begin()
-                while other.loss > enough and len(other.history) <= PROBING and other.advance() is None:
+                while rise(other.residuals) > 1.0 and len(other.history) <= PROBING and other.advance() is None:
                     pass
                 task.simulations = other.task.simulations
                 values, residuals = np.insert(other.values, k, values[k]), other.residuals
-            more = residuals @ residuals - enough
-            if more > 0.0:
-                missed = self._missed_by_the_step(values, residuals)
-                more = residuals @ residuals - self.loss - answer.unexplained**2 * (missed @ missed)
+            result = rise(residuals)
+            if result > 1.0 and answer.unexplained > SUSPECT:
+                # the step's error there, which may be greater
+                allowed = answer.unexplained**2 * float(np.sum(self._missed_by_the_step(values, residuals) ** 2))
+                result -= max(0.0, allowed - answer.moved**2) / answer.variance
         except SimulationError:
-            return None
-        return None if more > 0.0 else values
+            return np.inf
+        return result
 
     def result(self, ended: str) -> Result:
         task, width = self.task, self.task.high - self.task.low
         if not self.fresh:
             self._differentiate()
-        answer = self._answer()
-        if answer.unexplained > SUSPECT:
-            answer = self._answer(self._probes(answer))
+        missed = self._missed_by_the_step(self.values, self.residuals)
+        answer = self._answer(missed, self._probed(self._answer(missed)))
         of_residuals = np.sqrt(np.diag(answer.covariance))
         try:
             _, gradient = task.loss_and_gradient(self.values)
