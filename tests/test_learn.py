@@ -23,6 +23,7 @@ from warp_yarn.state import FIELDS
 
 scene_script = load("scenes/learn.py")
 optimizers = load("benchmarks/optimizers.py")
+uncertainty = load("benchmarks/uncertainty.py")
 
 SCENE = wy.paper.hung_cloth(rows=4, columns=4)
 FRAMES = 8
@@ -582,6 +583,46 @@ def test_a_step_that_cannot_be_halved_leaves_its_part_unknown(data, monkeypatch)
     result = learn(task(data, [SHEAR]))
     assert (result.step_error["shear"], result.step_share) == (0.0, 0.0)
     assert result.values["shear"] == pytest.approx(1000.0, rel=1e-3)
+
+
+# -- benchmarks/uncertainty.py: real yarns, and yarns that ring -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fabric", "pose", "of", "seeds"),
+    [("paper", "saddle", ("same", "finer"), 3), ("handkerchief", "flat", ("same",), 2)],
+)
+def test_uncertainties_hold_where_yarns_ring_and_where_they_hardly_tell(fabric, pose, of, seeds):
+    """Before: 170 standard deviations off with the ringing saddle's finer data, 40 with the handkerchief."""
+    for truth in of:
+        rows = uncertainty.scores(fabric, pose, truth, 5, range(seeds))
+        # 12 values at most; 3 standard deviations are what 1 of 370 normal ones exceeds
+        assert max(row["largest"] for row in rows) < 3.0
+        if (truth, pose) == ("same", "saddle"):
+            # noise is all there is, and the answer is as sharp as the data
+            assert all(row["determined"] == "3 of 3" and row["uncertainty"] < 1e-3 for row in rows)
+            # the mean of 12 squares of standard normal numbers, correlated: 1 ± 0.5
+            assert 0.2 < np.mean([row["spread"] ** 2 for row in rows]) < 3.0
+
+
+def test_differences_are_taken_above_what_the_solver_leaves():
+    cloth = uncertainty.cloth_of("handkerchief", "saddle", 5)
+    scene = wy.paper.hung(cloth)
+    target = motion(scene, 6, integrator="sdirk2", newton_tolerance=1e-10)
+    parameters = uncertainty.parameters_of(scene)
+
+    def apart(jacobian):
+        return (np.linalg.norm(jacobian - exact, axis=0) / np.linalg.norm(exact, axis=0)).max()
+
+    exact = Task(scene, target, parameters)
+    values = truth(exact)
+    exact = exact.jacobian(values, exact.residuals(values))
+    loose = Task(scene, target, parameters, newton_tolerance=1e-7)
+    residuals = loose.residuals(values)
+    plain = [loose._difference(values, residuals, wl.DIFFERENCE, -row) for row in np.eye(4)]
+    assert apart(-np.stack(plain, axis=1)) > 1.0  # noise, and no sign of it
+    # two that agree to a quarter
+    assert apart(loose.jacobian(values, residuals)) < 0.3
 
 
 # -- scenes/learn.py --------------------------------------------------------------------------------------------------

@@ -501,8 +501,8 @@ DETERMINED = 0.5 * UNKNOWN
 SUSPECT = 0.1
 """Part of the step's error of unknown shape above which other values are allowed their own step's error."""
 
-LINEAR = (7.0, 11.0)
-"""Variances that the loss rises by within three standard deviations, 9, where the model responds linearly enough."""
+LINEAR = 2.0
+"""Variances of 9, by which the loss rises within three standard deviations, that are linear enough."""
 
 PROBING = 10
 """Iterations in which other values are to show how good they are (``_Search._probed``)."""
@@ -662,7 +662,7 @@ class _Answer:
         share: of the step's error that the data are without.
         unexplained: part of the step's error that is of unknown shape, from 0 to 1.
         moved: by how much that changes the model [m].
-        variance: of a residual [m²].
+        variance: of a residual, with the unknown part of the step's error [m²].
     """
 
     covariance: np.ndarray
@@ -890,50 +890,55 @@ class _Search:
         step_error = np.where(determined, share * shift, 0.0)
         deviation = np.hypot(of_data, np.where(determined, np.hypot(share, spread) * shift, 0.0))
         without_step = np.sqrt(np.diag(uncertainties(self.jacobian, variance(left))))
-        return _Answer(own, of_data, deviation, without_step, step_error, share, unexplained, moved, of_residuals)
+        variance_left = of_residuals + of_step
+        return _Answer(own, of_data, deviation, without_step, step_error, share, unexplained, moved, variance_left)
 
     def _probed(self, answer: _Answer) -> np.ndarray:
         """Standard deviations of the data as the loss shows them, where the model does not respond linearly [p].
 
-        Each determined parameter is moved by three of them, to where it has more room, and the others with it: the loss
-        is to rise by 9 variances of a residual. Where it does not, others are learned anew there, and further away
-        too, as far as half of the range: a rise by n variances tells a deviation of 1/√n of the way.
+        Each determined parameter is moved by three of them, to where it has more room, and the others with it. Where
+        the loss does not change as the Jacobian says, the others are learned anew there, and further away too, as far
+        as half of the range: a rise by n variances of a residual tells a deviation of 1/√n of the way.
         """
         result = answer.of_data.copy()
         for k, deviation in enumerate(answer.of_data):
-            reach, start = 3.0 * deviation, self.y + 3.0 * deviation * answer.covariance[:, k] / answer.covariance[k, k]
-            side = 1.0 if self.y[k] < 0.5 else -1.0
-            if side < 0.0:
-                start = 2.0 * self.y - start
-            linear = True
+            side, reach = (1.0 if self.y[k] < 0.5 else -1.0), 3.0 * deviation
+            start = np.clip(self.y + side * reach * answer.covariance[:, k] / answer.covariance[k, k], 0.0, 1.0)
+            if deviation >= DETERMINED or self._is_linear(start, answer):
+                continue
             while result[k] < DETERMINED:
-                move = side * min(reach, 0.5)
-                start = np.clip(start, 0.0, 1.0)
-                start[k] = self.y[k] + move
-                rise = self._rise(k, self._physical(start), answer, linear)
-                if linear and LINEAR[0] < rise < LINEAR[1]:
+                move = min(reach, 0.5)
+                start[k] = self.y[k] + side * move
+                rise, values = self._rise(k, self._physical(start), answer)
+                away = np.abs(values - self.values) / (self.task.high - self.task.low)
+                result = np.maximum(result, away / np.sqrt(max(rise, 1.0)))
+                if move == 0.5:
                     break
-                result[k] = max(result[k], abs(move) / np.sqrt(max(rise, 1.0)))
-                if reach >= 0.5:
-                    break
-                start = (self.task.start - self.task.low) / (self.task.high - self.task.low)
-                reach, linear = 3.0 * reach, False
+                reach, start = 3.0 * reach, (self.task.start - self.task.low) / (self.task.high - self.task.low)
         return result
 
-    def _rise(self, k: int, values: np.ndarray, answer: _Answer, linear: bool) -> float:
-        """How many variances the loss rises by that the step's error does not allow, near these values with k held.
+    def _is_linear(self, y: np.ndarray, answer: _Answer) -> bool:
+        """Whether the loss there is what the Jacobian says, but for some variances of a residual."""
+        expected = self.residuals + self.jacobian @ (y - self.y)
+        try:
+            residuals = self.task.residuals(self._physical(y))
+        except SimulationError:
+            return False
+        return abs(residuals @ residuals - expected @ expected) < LINEAR * answer.variance
 
-        Args:
-            linear: whether the rise of a linear model is enough to know.
-        """
+    def _rise(self, k: int, values: np.ndarray, answer: _Answer) -> tuple[float, np.ndarray]:
+        """How many variances the loss rises by that the step's error does not allow, with k held as here; and where."""
         task = self.task
 
         def rise(residuals: np.ndarray) -> float:
-            return (residuals @ residuals - self.loss - answer.moved**2) / answer.variance
+            return (residuals @ residuals - self.loss - allowed) / answer.variance
+
+        suspect = answer.unexplained > SUSPECT
+        allowed = answer.moved**2 if suspect else 0.0
 
         try:
             residuals = task.residuals(values)
-            if rise(residuals) > 1.0 and not (linear and LINEAR[0] < rise(residuals) < LINEAR[1]) and len(values) > 1:
+            if rise(residuals) > 1.0 and len(values) > 1:
                 other = _Search(task.held(k, values), self.resolution, halvings=0)
                 other.begin()
                 while rise(other.residuals) > 1.0 and len(other.history) <= PROBING and other.advance() is None:
@@ -941,13 +946,13 @@ class _Search:
                 task.simulations = other.task.simulations
                 values, residuals = np.insert(other.values, k, values[k]), other.residuals
             result = rise(residuals)
-            if result > 1.0 and answer.unexplained > SUSPECT:
+            if result > 1.0 and suspect:
                 # the step's error there, which may be greater
-                allowed = answer.unexplained**2 * float(np.sum(self._missed_by_the_step(values, residuals) ** 2))
-                result -= max(0.0, allowed - answer.moved**2) / answer.variance
+                there = answer.unexplained**2 * float(np.sum(self._missed_by_the_step(values, residuals) ** 2))
+                result -= max(0.0, there - allowed) / answer.variance
         except SimulationError:
-            return np.inf
-        return result
+            return np.inf, values
+        return result, values
 
     def result(self, ended: str) -> Result:
         task, width = self.task, self.task.high - self.task.low
