@@ -605,6 +605,17 @@ def test_uncertainties_hold_where_yarns_ring_and_where_they_hardly_tell(fabric, 
             assert 0.2 < np.mean([row["spread"] ** 2 for row in rows]) < 3.0
 
 
+def test_scores_reach_the_csv_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(uncertainty, "one_core", lambda: None)
+    output = tmp_path / "uncertainty.csv"
+    only = ["--seeds", "1", "--size", "4", "--fabrics", "paper", "--poses", "flat", "--data", "same"]
+    uncertainty.main([*only, "--output", str(output)])
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["parameter"] for row in rows] == ["density[0]", "stretch[0]", "bend[0]", "shear"]
+    assert "same: spread" in capsys.readouterr().out
+
+
 def test_differences_are_taken_above_what_the_solver_leaves():
     cloth = uncertainty.cloth_of("handkerchief", "saddle", 5)
     scene = wy.paper.hung(cloth)
