@@ -536,7 +536,8 @@ class Result:
         task: with the model's step that the values were learned with; the task's own, or one so many times halved.
         parameters: what was to be learned.
         values: by name.
-        uncertainty: standard deviations, by name: what the data leave open (``uncertainties``) and the step's error.
+        uncertainty: standard deviations, by name: what the data leave open (``uncertainties``; where the model does not
+            respond linearly, as the loss rises) and the step's error, as far as it is known and as far as it is not.
         step_error: by name, how much of the value is due to the model's time step, estimated (``step_errors``) from a
             run with half the step; 0 where that run fails, and of what is not determined.
         step_share: how much of the step's error the data do not have, from 0, data of the same method and step, to 1,
