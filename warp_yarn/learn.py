@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
+import itertools
+import math
 import os
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -140,11 +144,61 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
     return result
 
 
+def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, steps: int) -> Scene:
+    """Give a scene the rows of ``pin_path`` and ``forces`` that a model needs whose steps are not the scene's rows.
+
+    Row k of a path is of the time from k to k + 1, in rows. The model's step j is of the time from first + j ratio to
+    first + (j + 1) ratio. Pins move linearly from row to row, and a force is its mean over the model's step: the motion
+    of the pins and the impulse of the forces are the same with every step.
+
+    Args:
+        scene: the scene, left as it is.
+        start: where the pins are at time 0, before their first row [pins, 3] (m).
+        first: row that the model's first step begins with.
+        ratio: the model's step in rows.
+        steps: how many it makes.
+    """
+    result = copy.copy(scene)
+    # as integers over the denominator, so that times of rows are hit exactly
+    times = np.array([first * ratio.denominator + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
+    if scene.pin_path is not None:
+        places = np.concatenate([start[None], scene.pin_path]).reshape(len(scene.pin_path) + 1, -1)
+        rows = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
+        result.pin_path = np.stack(rows, axis=1).reshape(steps, -1, 3)
+    if len(scene.force_path) > 1:
+        last = len(scene.force_path) - 1
+        path = np.empty((steps + 1, *scene.force_path.shape[1:]))
+        for j, (begin, end) in enumerate(itertools.pairwise(times)):
+            rows = np.arange(math.floor(begin), math.ceil(end))
+            share = (np.minimum(rows + 1, end) - np.maximum(rows, begin)) / (end - begin)
+            path[j] = np.tensordot(share, scene.force_path[np.minimum(rows, last)], axes=1)
+        path[-1] = scene.force_path[-1]
+        result.force_path = path
+    return result
+
+
 # -- the problem ------------------------------------------------------------------------------------------------------
 
 DIFFERENCE = 1e-4
-"""Width of differences of runs [ranges]: curvature adds some 1e-4 of a derivative to it, and what the solver leaves of
-runs, some 1e-8 of the motion, no more."""
+"""Width of differences of runs [ranges]: curvature adds some 1e-4 of a derivative to it."""
+
+WIDER, WIDEST = 30.0, 0.1
+"""Where differences may be what the solver leaves of runs, and do not agree with their neighbours, they are taken so
+many times as wide, and so wide at most [ranges]."""
+
+SOLVED = 1e-10
+"""``newton_tolerance`` of runs in double precision. What 1e-8, that of gradients, leaves of runs of light, stiff yarns
+is as large as what small changes of some parameters make, and a search finds no way through it."""
+
+TINY = 1e-8
+"""A change of all values that changes little but what the solver leaves [ranges]."""
+
+CLEAR = 30.0
+"""A change of residuals that is so many times what one run shows that the solver leaves is a change."""
+
+SURE = 1e-6
+"""So is one that is this part of the nodes' paths: the solver sometimes leaves much more than one run shows, some 4e-7
+of the path of light, stiff yarns."""
 
 
 class Task:
@@ -154,6 +208,13 @@ class Task:
     positions are compared with those of the frames after it. Methods take the values of the parameters, in their units
     and in their order, as an array [parameters].
 
+    ``pin_path`` and ``forces`` of the scene go by the target's frames, whatever the model's step: row k is of the time
+    from frame k to frame k + 1, so that learning from frame ``first`` on begins with row ``first``. In steps of another
+    length pins move linearly from row to row (to row 0 from where frame 0 has them), and a force is its mean over the
+    step: that of the row where the step lies in one.
+
+    A task can be copied, pickled and sent to another process, and so can a ``Result``; its rollout is made there anew.
+
     Args:
         scene: the model; what is not learned keeps its values.
         target: the frames.
@@ -162,12 +223,14 @@ class Task:
         first: the frame to start from.
         every: take only every so many-th frame after it (10: data at 0.1 ms as frames of 1 ms).
         step: h of the model [s]; the time between compared frames must be a whole multiple of it. None: that time.
-        options: of the Simulator: integrator, tolerance, device, ...
+        options: of the Simulator: integrator, tolerance, device, ... ``newton_tolerance`` is 1e-10 in double precision.
 
     Attributes:
         initial: the state that the model starts in.
         positions: what it is compared with [frames, nodes, 3] (m).
+        path: length of the nodes' paths from frame to frame, root mean square [m].
         step: its step [s].
+        rollout: of the scene with its own values, of the model's step.
         cost: how many runs one of its runs counts as: 1, or so many times as its step was halved, in powers of 2.
         simulations: runs made so far, those that gradients begin with among them.
         gradients: backward runs made so far.
@@ -186,6 +249,8 @@ class Task:
         **options: Any,
     ):
         self.scene, self.parameters, self.options = scene, tuple(parameters), options
+        if options.get("precision", "double") == "double":
+            options.setdefault("newton_tolerance", SOLVED)
         self.names = [p.name for p in self.parameters]
         self.low, self.high, self.start = (
             np.array([getattr(p, end) for p in self.parameters], dtype=np.float64) for end in ("low", "high", "start")
@@ -195,6 +260,10 @@ class Task:
         self.initial = target[int(chosen[0])]
         self.positions = target.position[chosen[1:]].copy()
         self.frame_time = target.step * every
+        self._first, self._every = first, every
+        paths = np.diff(target.position[chosen], axis=0)
+        self.path = float(np.sqrt(np.mean(np.linalg.norm(paths, axis=2).sum(axis=0) ** 2)))
+        self._pins_at_start = target.position[0, scene.pins].copy()
         self._state = {name: torch.as_tensor(getattr(self.initial, name)) for name in FIELDS}
         self._prepare(1 if step is None else self._steps_per_frame(number("step", step, above=0.0)))
         self.cost = 1
@@ -203,15 +272,40 @@ class Task:
     def _prepare(self, steps_per_frame: int) -> None:
         """Settles the step, and with it the rollout."""
         self.steps_per_frame, self.step = steps_per_frame, self.frame_time / steps_per_frame
-        after = np.arange(1, len(self.positions) + 1) * steps_per_frame
-        self.rollout = Rollout(self.scene, int(after[-1]), frames=after.tolist(), step=self.step, **self.options)
+        self.__dict__.pop("rollout", None)
         self.rollout.simulator.state = self.initial  # to have it checked
+
+    @functools.cached_property
+    def rollout(self) -> Rollout:
+        after = np.arange(1, len(self.positions) + 1) * self.steps_per_frame
+        scene = self._in_steps(self.scene, self.steps_per_frame, len(self.positions))
+        return Rollout(scene, int(after[-1]), frames=after.tolist(), step=self.step, **self.options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # what is on the device stays there
+        return {name: value for name, value in self.__dict__.items() if name != "rollout"}
+
+    def _in_steps(self, scene: Scene, steps_per_frame: int, frames: int) -> Scene:
+        """A scene whose paths go by the model's steps."""
+        ratio = Fraction(self._every, steps_per_frame)
+        return with_paths(scene, self._pins_at_start, self._first, ratio, steps_per_frame * frames)
 
     def halved(self) -> Task:
         """The same task for a model of half the step, with the runs that this one has made."""
         result = copy.copy(self)
         result._prepare(2 * self.steps_per_frame)
         result.cost = 2 * self.cost
+        return result
+
+    def held(self, k: int, values: np.ndarray) -> Task:
+        """The same task without parameter k, which has its value of these; the others start with theirs."""
+        result = copy.copy(self)
+        result.scene = with_values(self.scene, {self.names[k]: values[k]})
+        kept = [j for j in range(len(values)) if j != k]
+        result.parameters = tuple(dataclasses.replace(self.parameters[j], start=values[j]) for j in kept)
+        result.names = [self.names[j] for j in kept]
+        result.low, result.high, result.start = self.low[kept], self.high[kept], values[kept]
+        result._prepare(self.steps_per_frame)
         return result
 
     def _check_parameters(self) -> None:
@@ -308,7 +402,10 @@ class Task:
         return float(loss.detach()), np.array([float(part if k is None else part[k]) for part, k in parts])
 
     def jacobian(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """∂residuals/∂y [residuals, parameters], y = (value − low)/(high − low), by differences: a run a parameter.
+        """∂residuals/∂y [residuals, parameters], y = (value − low)/(high − low), by differences.
+
+        A run a parameter, and one that shows what the solver leaves. A difference that may be no more than that is
+        compared with one from there on, and taken wider until the two agree; 0 where the widest have nothing in common.
 
         Args:
             values: where.
@@ -317,22 +414,45 @@ class Task:
         Raises:
             SimulationError: the model can be simulated on neither side.
         """
-        columns = []
-        for k, value in enumerate(values):
-            middle, width = 0.5 * (self.low[k] + self.high[k]), self.high[k] - self.low[k]
-            change = DIFFERENCE if value < middle else -DIFFERENCE
-            moved = values.copy()
+        inwards = np.where(values < 0.5 * (self.low + self.high), 1.0, -1.0)
+        moves = np.diag(inwards)
+        columns = [self._difference(values, residuals, DIFFERENCE, move) for move in moves]
+        tiny = self._difference(values, residuals, TINY, inwards)
+        left = TINY * float(np.linalg.norm(tiny - np.sum(columns, axis=0)))
+        for k, move in enumerate(moves):
+            if DIFFERENCE * np.linalg.norm(columns[k]) < max(CLEAR * left, SURE * self.path):
+                columns[k] = self._confirmed(values, residuals, columns[k], move)
+        return np.stack(columns, axis=1) * inwards
+
+    def _confirmed(self, values: np.ndarray, residuals: np.ndarray, column: np.ndarray, move: np.ndarray) -> np.ndarray:
+        """A difference by ``move`` that another agrees with, beginning with a column of the usual width."""
+        width = DIFFERENCE
+        while True:
             try:
-                moved[k] = value + change * width
-                column = self.residuals(moved)
+                both = self._difference(values, residuals, 2.0 * width, move)
+            except SimulationError:  # so far from here the model fails: what there is must do
+                return column
+            # the other is 2 both − column
+            apart, together = np.linalg.norm(2.0 * (both - column)), np.linalg.norm(2.0 * both)
+            if apart < 0.25 * together:
+                return both
+            if width == WIDEST:
+                return both if apart < together else np.zeros_like(both)
+            width = min(WIDER * width, WIDEST)
+            try:
+                column = self._difference(values, residuals, width, move)
             except SimulationError:
-                change = -change
-                moved[k] = value + change * width
-                if not self.low[k] <= moved[k] <= self.high[k]:
-                    raise
-                column = self.residuals(moved)
-            columns.append((column - residuals) / change)
-        return np.stack(columns, axis=1)
+                return both
+
+    def _difference(self, values: np.ndarray, residuals: np.ndarray, width: float, move: np.ndarray) -> np.ndarray:
+        """(r(y + width · move) − r(y))/width, with −width where the model fails and values stay in their ranges."""
+        change = width * move * (self.high - self.low)
+        try:
+            return (self.residuals(values + change) - residuals) / width
+        except SimulationError:
+            if np.any(values - change < self.low) or np.any(values - change > self.high):
+                raise
+            return (self.residuals(values - change) - residuals) / -width
 
     def trajectory(self, values: np.ndarray, frames: int | None = None, *, refine: int = 1) -> Trajectory:
         """The model's motion with these values: the initial state, and frames as far apart as those compared.
@@ -348,7 +468,7 @@ class Task:
         every = self.steps_per_frame * whole("refine", refine, least=1)
         # The kernels that learning has compiled, though nothing is differentiated.
         options = {**self.options, "step": self.frame_time / every, "differentiable": True}
-        simulator = Simulator(self.scene_with(values), **options)
+        simulator = Simulator(self._in_steps(self.scene_with(values), every, count), **options)
         simulator.state = self.initial
         motion = simulator.run(count * every)
         parts = {name: getattr(motion, name)[::every] for name in FIELDS}
@@ -372,8 +492,20 @@ KNOWN = 0.015
 LESS = 0.9
 """What must be left of a standard deviation, as far as can be foreseen, for a shorter step to be worth its runs."""
 
-DETERMINED = 0.5 / np.sqrt(12.0)
+UNKNOWN = 1.0 / np.sqrt(12.0)
+"""Standard deviation of a uniform distribution over a range [ranges]."""
+
+DETERMINED = 0.5 * UNKNOWN
 """Standard deviation below which the data determine a parameter [ranges]: half of what the range alone says."""
+
+SUSPECT = 0.1
+"""Part of the step's error of unknown shape above which other values are allowed their own step's error."""
+
+LINEAR = 2.0
+"""Variances of 9, by which the loss rises within three standard deviations, that are linear enough."""
+
+PROBING = 10
+"""Iterations in which other values are to show how good they are (``_Search._probed``)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -404,7 +536,8 @@ class Result:
         task: with the model's step that the values were learned with; the task's own, or one so many times halved.
         parameters: what was to be learned.
         values: by name.
-        uncertainty: standard deviations, by name: what the data leave open (``uncertainties``) and the step's error.
+        uncertainty: standard deviations, by name: what the data leave open (``uncertainties``; where the model does not
+            respond linearly, as the loss rises) and the step's error, as far as it is known and as far as it is not.
         step_error: by name, how much of the value is due to the model's time step, estimated (``step_errors``) from a
             run with half the step; 0 where that run fails, and of what is not determined.
         step_share: how much of the step's error the data do not have, from 0, data of the same method and step, to 1,
@@ -464,26 +597,42 @@ def learn(
         halvings: how many times the model's step may be halved. It is where it leaves a value less sure than KNOWN, as
             far as its error stands in the residuals (``Result.step_share``), and where a model of half the step, with
             values without the step's part, is nearer to the data. Those of the model's own step and method are not.
-        checkpoint: a file, ending in .npz, that is written after every iteration. Where it is there already, learning
-            goes on from it, and ends where it would have ended without the interruption.
+        checkpoint: a file, ending in .npz, that is written at the start and after every iteration. Where it is there
+            already, learning goes on from it, and ends where it would have ended without the interruption.
         progress: show a bar with the loss and the values, on a terminal.
         watch: called after every iteration.
 
     Raises:
         InputError: an argument out of its range, or a checkpoint of another task.
-        SimulationError: the model cannot be simulated with the start values. A later step to such values is shortened.
+        SimulationError: the model cannot be simulated with the start values, or not on either side of later ones. A
+            step to such values is shortened.
+
+    Every exception, KeyboardInterrupt too, has the iterations until then as ``iterations`` [list of Iteration]: the
+    last one's values are the best so far.
     """
     whole("iterations", iterations, least=0)
     search = _Search(task, number("resolution", resolution, above=0.0), whole("halvings", halvings, least=0))
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.suffix != ".npz":
         raise InputError(f"checkpoint = {str(checkpoint)!r}, must end in .npz")
+    try:
+        return _iterate(search, iterations, path, progress, watch)
+    except BaseException as error:
+        error.iterations = list(search.history)
+        raise
+
+
+def _iterate(
+    search: _Search, iterations: int, path: Path | None, progress: bool, watch: Callable[[Iteration], None]
+) -> Result:
     # The first run compiles the kernels where they changed, which takes many seconds, and says so meanwhile.
     with tqdm.tqdm(desc="compiling", bar_format=BAR, disable=None if progress else True) as bar:
         if path is not None and path.exists():
             search.load(path)
         else:
             search.begin()
+            if path is not None:
+                search.save(path)
         watch(search.history[-1])
         bar.set_description("learning", refresh=False)
         ended = None
@@ -507,17 +656,25 @@ class _Answer:
 
     Args:
         covariance: of the values, as far as the residuals tell [p, p].
-        deviation: standard deviations, the step's error included [p].
+        of_data: standard deviations without the known part of the step's error [p].
+        deviation: standard deviations, all of the step's error included [p].
         without_step: what they would be without the part of the residuals that the step explains [p].
         step_error: the part of the values that is due to the step [p].
         share: of the step's error that the data are without.
+        unexplained: part of the step's error that is of unknown shape, from 0 to 1.
+        moved: by how much that changes the model [m].
+        variance: of a residual, with the unknown part of the step's error [m²].
     """
 
     covariance: np.ndarray
+    of_data: np.ndarray
     deviation: np.ndarray
     without_step: np.ndarray
     step_error: np.ndarray
     share: float
+    unexplained: float
+    moved: float
+    variance: float
 
 
 class _Search:
@@ -637,7 +794,7 @@ class _Search:
         """Goes on with half the model's step, from values without its error, where that is worth it and nearer."""
         if self.task.steps_per_frame == self.most_steps:
             return False
-        now = self._answer()
+        now = self._answer(self._missed_by_the_step(self.values, self.residuals))
         if not np.any((now.deviation > KNOWN) & (now.without_step < LESS * now.deviation)):
             return False
         finer, y = self.task.halved(), np.clip(self.y - now.step_error, 0.0, 1.0)
@@ -709,27 +866,104 @@ class _Search:
 
     # -- the answer --------------------------------------------------------------------------------------------------
 
-    def _answer(self) -> _Answer:
-        """What the data leave open here."""
-        shift, rest, share = step_errors(self.jacobian, self.residuals, self._missed_by_the_step(), self.resolution)
+    def _answer(self, missed: np.ndarray, least: np.ndarray | float = 0.0) -> _Answer:
+        """What the data leave open here, at least so much; ``missed`` is the step's error."""
+        shift, rest, share = step_errors(self.jacobian, self.residuals, missed, self.resolution)
+        left = self.residuals + share * rest
 
-        def covariance(residuals: np.ndarray) -> np.ndarray:
-            return uncertainties(self.jacobian, residual_variance(self._field(residuals), len(self.y), self.resolution))
+        def variance(residuals: np.ndarray) -> float:
+            return residual_variance(self._field(residuals), len(self.y), self.resolution)
 
         # Of all that is left, not of what the step does not explain: where the step is too long for its error to be one
         # of first order, that would be too sure (stretch[1] of 5 × 5: 11 % off with 0.6 %).
-        own = covariance(self.residuals)
+        of_residuals = variance(self.residuals)
+        unexplained = unexplained_part(self._field(rest), self._field(left))
+        moved = unexplained * float(np.linalg.norm(missed))
+        of_step = moved**2 / independent(self._field(missed))
+        own = uncertainties(self.jacobian, of_residuals + of_step)
         of_data = np.sqrt(np.diag(own))
-        step_error = np.where(of_data < DETERMINED, share * shift, 0.0)
-        without_step = np.sqrt(np.diag(covariance(self.residuals + share * rest)))
-        return _Answer(own, np.hypot(of_data, step_error), without_step, step_error, share)
+        # a motion that differs by no more than the step's error may be the true one
+        for i in self.history:
+            if i.loss - self.loss <= moved**2:
+                of_data = np.maximum(of_data, np.abs(i.values - self.values) / (self.task.high - self.task.low))
+        of_data = np.minimum(np.maximum(of_data, least), UNKNOWN)
+        determined = of_data < DETERMINED
+        # noise makes a share where there is none
+        spread = min(1.0, float(np.sqrt(of_residuals / max(rest @ rest, np.finfo(float).tiny))))
+        step_error = np.where(determined, share * shift, 0.0)
+        deviation = np.hypot(of_data, np.where(determined, np.hypot(share, spread) * shift, 0.0))
+        without_step = np.sqrt(np.diag(uncertainties(self.jacobian, variance(left))))
+        variance_left = of_residuals + of_step
+        return _Answer(own, of_data, deviation, without_step, step_error, share, unexplained, moved, variance_left)
+
+    def _probed(self, answer: _Answer) -> np.ndarray:
+        """Standard deviations of the data as the loss shows them, where the model does not respond linearly [p].
+
+        Each determined parameter is moved by three of them, to where it has more room, and the others with it. Where
+        the loss does not change as the Jacobian says, the others are learned anew there, and further away too, as far
+        as half of the range: a rise by n variances of a residual tells a deviation of 1/√n of the way.
+        """
+        result = answer.of_data.copy()
+        for k, deviation in enumerate(answer.of_data):
+            side, reach = (1.0 if self.y[k] < 0.5 else -1.0), 3.0 * deviation
+            start = np.clip(self.y + side * reach * answer.covariance[:, k] / answer.covariance[k, k], 0.0, 1.0)
+            if deviation >= DETERMINED or self._is_linear(start, answer):
+                continue
+            while result[k] < DETERMINED:
+                move = min(reach, 0.5)
+                start[k] = self.y[k] + side * move
+                rise, values = self._rise(k, self._physical(start), answer)
+                away = np.abs(values - self.values) / (self.task.high - self.task.low)
+                result = np.maximum(result, away / np.sqrt(max(rise, 1.0)))
+                if move == 0.5:
+                    break
+                reach, start = 3.0 * reach, (self.task.start - self.task.low) / (self.task.high - self.task.low)
+        return result
+
+    def _is_linear(self, y: np.ndarray, answer: _Answer) -> bool:
+        """Whether the loss there is what the Jacobian says, but for some variances of a residual."""
+        expected = self.residuals + self.jacobian @ (y - self.y)
+        try:
+            residuals = self.task.residuals(self._physical(y))
+        except SimulationError:
+            return False
+        return abs(residuals @ residuals - expected @ expected) < LINEAR * answer.variance
+
+    def _rise(self, k: int, values: np.ndarray, answer: _Answer) -> tuple[float, np.ndarray]:
+        """How many variances the loss rises by that the step's error does not allow, with k held as here; and where."""
+        task = self.task
+
+        def rise(residuals: np.ndarray) -> float:
+            return (residuals @ residuals - self.loss - allowed) / answer.variance
+
+        suspect = answer.unexplained > SUSPECT
+        allowed = answer.moved**2 if suspect else 0.0
+
+        try:
+            residuals = task.residuals(values)
+            if rise(residuals) > 1.0 and len(values) > 1:
+                other = _Search(task.held(k, values), self.resolution, halvings=0)
+                other.begin()
+                while rise(other.residuals) > 1.0 and len(other.history) <= PROBING and other.advance() is None:
+                    pass
+                task.simulations = other.task.simulations
+                values, residuals = np.insert(other.values, k, values[k]), other.residuals
+            result = rise(residuals)
+            if result > 1.0 and suspect:
+                # the step's error there, which may be greater
+                there = answer.unexplained**2 * float(np.sum(self._missed_by_the_step(values, residuals) ** 2))
+                result -= max(0.0, there - allowed) / answer.variance
+        except SimulationError:
+            return np.inf, values
+        return result, values
 
     def result(self, ended: str) -> Result:
         task, width = self.task, self.task.high - self.task.low
         if not self.fresh:
             self._differentiate()
-        answer = self._answer()
-        of_data = np.sqrt(np.diag(answer.covariance))
+        missed = self._missed_by_the_step(self.values, self.residuals)
+        answer = self._answer(missed, self._probed(self._answer(missed)))
+        of_residuals = np.sqrt(np.diag(answer.covariance))
         try:
             _, gradient = task.loss_and_gradient(self.values)
         except GradientError:  # of steps that could only be made in parts
@@ -745,8 +979,8 @@ class _Search:
             uncertainty=by_name(answer.deviation * width),
             step_error=by_name(answer.step_error * width),
             step_share=answer.share,
-            status={name: _status(*of) for name, *of in zip(task.names, self.y, of_data, strict=True)},
-            correlation=answer.covariance / np.outer(of_data, of_data),
+            status={name: _status(*of) for name, *of in zip(task.names, self.y, answer.of_data, strict=True)},
+            correlation=answer.covariance / np.outer(of_residuals, of_residuals),
             loss=self.loss,
             gradient=gradient * width,
             history=self.history,
@@ -761,17 +995,17 @@ class _Search:
         weave = self.task.scene.cloth.weave
         return residuals.reshape(-1, weave.rows, weave.columns, 3)
 
-    def _missed_by_the_step(self) -> np.ndarray:
+    def _missed_by_the_step(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """Estimate of what the residuals at these values would gain if the step went to 0 [residuals]; 0 if unknown."""
         task = self.task
         task.simulations += 2 * task.cost
         try:
-            finer = task.trajectory(self.values, refine=2).position[1:]
+            finer = task.trajectory(values, refine=2).position[1:]
         except SimulationError:
-            return np.zeros(len(self.residuals))
+            return np.zeros(len(residuals))
         offset = (finer - task.positions).ravel() / np.sqrt(len(task.positions) * task.scene.cloth.nodes)
         power = 2.0**task.rollout.simulator.integrator.order
-        return (offset - self.residuals) * power / (power - 1.0)
+        return (offset - residuals) * power / (power - 1.0)
 
 
 _OF_ITERATIONS = tuple(field.name for field in dataclasses.fields(Iteration))
@@ -830,14 +1064,31 @@ def step_errors(
     return shift, rest, float(share)
 
 
+def unexplained_part(rest: np.ndarray, left: np.ndarray) -> float:
+    """How much of the step's error, from 0 to 1, the values may have taken in without its being known how.
+
+    ``step_errors`` goes by the shape of e, which is that of the error only where the step resolves the motion. A
+    pattern in what that leaves of the residuals may be the step's error in another shape: as much of it as the pattern
+    is of the part of e that the values could not take in. Noise has no pattern.
+
+    Args:
+        rest: e − J A e [frames, rows, columns, 3] (m).
+        left: the residuals without what the step explains, likewise.
+    """
+    pattern = np.linalg.norm(left) * np.sqrt(max(0.0, 1.0 - independent(left) / left.size))
+    return float(min(1.0, pattern / max(np.linalg.norm(rest), np.finfo(float).tiny)))
+
+
 def independent(residuals: np.ndarray) -> float:
     """How many of these residuals [frames, rows, columns, 3] are independent, at the least.
 
     What is learned is a weighted sum of residuals, and the variance of one whose weights have the norm 1 is at most the
     largest eigenvalue λ of their correlation, which is 1 where they are independent. So n along an axis count as n/λ,
     with the correlation along it as the other axes show it: as 1 where all are alike, and as 1 or 2 where they
-    oscillate, though neighbours differ then. In N samples of noise λ is up to some (1 + √(n/N))² (Marchenko and
-    Pastur): what is below counts as 1. N counts samples that may be alike too, which errs to the safe side.
+    oscillate, though neighbours differ then. In N samples of noise λ is some (1 + √(n/N))² (Marchenko and Pastur), in
+    one case of a thousand it is more than that and 3.27 of its widths (Johnstone, "On the distribution of the largest
+    eigenvalue in principal components analysis", 2001): what is below counts as 1. N counts samples that may be alike
+    too, which errs to the safe side.
     """
     result = float(residuals.shape[3])
     for axis in range(3):
@@ -846,6 +1097,8 @@ def independent(residuals: np.ndarray) -> float:
         covariance = along @ along.T
         mean = np.trace(covariance) / n
         largest = np.linalg.eigvalsh(covariance)[-1]
-        of_noise = (1.0 + np.sqrt(n / along.shape[1])) ** 2
+        size = np.sqrt(along.shape[1]) + np.sqrt(n)
+        width = size * (1.0 / np.sqrt(along.shape[1]) + 1.0 / np.sqrt(n)) ** (1.0 / 3.0)
+        of_noise = (size**2 + 3.27 * width) / along.shape[1]
         result *= n * mean / largest if largest > of_noise * mean else n
     return result
