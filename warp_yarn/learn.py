@@ -25,7 +25,6 @@ import torch
 import tqdm
 
 from .arrays import STATE_TYPES
-from .cloth import Cloth
 from .errors import GradientError, InputError, SimulationError, finite_array, number, whole
 from .files import whole_file
 from .scene import Scene
@@ -126,22 +125,23 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
     for name in values:
         value_of(scene, name)
     parts: dict[tuple[str, int | None], Any] = {split(name): float(value) for name, value in values.items()}
-    old, result = scene.cloth, copy.copy(scene)
+    old = scene.cloth
+    changes: dict[str, Any] = {}
     yarns = [
         dataclasses.replace(yarn, **{base: value for (base, j), value in parts.items() if base in OF_YARNS and j == k})
         for k, yarn in enumerate(old.yarns)
     ]
     numbers = {name: parts.get((name, None), getattr(old, name)) for name in CLOTH_NUMBERS}
-    result.cloth = Cloth(old.weave, yarns=yarns, warp=old.warp, weft=old.weft, pose=old.position, **numbers)
+    changes["cloth"] = old.replace(yarns=yarns, pose=old.position, **numbers)
     if scene.wind is not None:
         velocity: Any = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
         rest = {OF_WINDS[name]: parts[name, None] for name in ("wind_density", "wind_drag") if (name, None) in parts}
-        result.wind = dataclasses.replace(scene.wind, velocity=velocity, **rest)
+        changes["wind"] = dataclasses.replace(scene.wind, velocity=velocity, **rest)
     if scene.gravity is not None:
-        result.gravity = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
+        changes["gravity"] = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
     if ("pin_stiffness", None) in parts:
-        result.pin_stiffness = number("pin_stiffness", parts["pin_stiffness", None], above=0.0)
-    return result
+        changes["pin_stiffness"] = parts["pin_stiffness", None]
+    return scene.replace(**changes)
 
 
 def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, steps: int) -> Scene:
@@ -158,23 +158,23 @@ def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, ste
         ratio: the model's step in rows.
         steps: how many it makes.
     """
-    result = copy.copy(scene)
+    changes: dict[str, Any] = {}
     # as integers over the denominator, so that times of rows are hit exactly
     times = np.array([first * ratio.denominator + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
     if scene.pin_path is not None:
         places = np.concatenate([start[None], scene.pin_path]).reshape(len(scene.pin_path) + 1, -1)
         rows = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
-        result.pin_path = np.stack(rows, axis=1).reshape(steps, -1, 3)
+        changes["pin_path"] = np.stack(rows, axis=1).reshape(steps, -1, 3)
     if len(scene.force_path) > 1:
         last = len(scene.force_path) - 1
-        path = np.empty((steps + 1, *scene.force_path.shape[1:]))
+        path = np.zeros((steps + 1, *scene.force_path.shape[1:]))
         for j, (begin, end) in enumerate(itertools.pairwise(times)):
             rows = np.arange(math.floor(begin), math.ceil(end))
             share = (np.minimum(rows + 1, end) - np.maximum(rows, begin)) / (end - begin)
             path[j] = np.tensordot(share, scene.force_path[np.minimum(rows, last)], axes=1)
-        path[-1] = scene.force_path[-1]
-        result.force_path = path
-    return result
+        forces = enumerate(scene.forces.items())
+        changes["forces"] = {node: f if f.ndim == 1 else path[:-1, k] for k, (node, f) in forces}
+    return scene.replace(**changes)
 
 
 # -- the problem ------------------------------------------------------------------------------------------------------

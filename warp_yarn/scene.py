@@ -176,9 +176,3 @@ class Scene(Fixed):
             if name in missing:
                 raise InputError(f"terms names {name!r}, but {missing[name]}")
         return tuple(name for name in TERMS if name in names or name == "mass")
-
-    def __copy__(self) -> Scene:
-        """A copy to be changed before it is used, as ``learn.with_values`` does."""
-        result = object.__new__(type(self))
-        vars(result).update({name: value for name, value in vars(self).items() if name != "_arguments"})
-        return result
