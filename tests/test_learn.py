@@ -202,19 +202,21 @@ def moved(stiffness, until=24):
     return wy.Scene(cloth, pins=pins, pin_stiffness=stiffness, pin_path=path, forces=forces)
 
 
+@pytest.mark.parametrize("integrator", ["linear", "sdirk2"])
 @pytest.mark.parametrize("stiffness", [None, 1e4])
-def test_paths_begin_with_the_frame_that_learning_begins_with(stiffness):
-    scene = moved(stiffness)
-    data = motion(scene, 24)
+def test_paths_begin_with_the_frame_that_learning_begins_with(stiffness, integrator):
+    """Also where stages ask for the pins' places within a step."""
+    scene, options = moved(stiffness), {"integrator": integrator, "newton_tolerance": 1e-10}
+    data = motion(scene, 24, **options)
     for first, every in ((8, 1), (0, 1), (9, 3), (22, 1)):
-        problem = task(data, [SHEAR], scene, first=first, every=every, step=1e-3)
+        problem = task(data, [SHEAR], scene, first=first, every=every, step=1e-3, **options)
         # the same steps from the same state, to the last bit
         assert problem.loss(truth(problem)) == 0.0
         again = problem.trajectory(truth(problem))
         np.testing.assert_array_equal(again.position, data.position[first::every][: len(again)])
     # after the last row pins stay, and the force that ends is 0
-    longer = motion(scene, 30)
-    problem = task(longer, [SHEAR], scene, first=20)
+    longer = motion(scene, 30, **options)
+    problem = task(longer, [SHEAR], scene, first=20, **options)
     assert problem.loss(truth(problem)) == 0.0
     assert problem.trajectory(truth(problem), 12).position[:11] == pytest.approx(longer.position[20:], abs=0.0)
 

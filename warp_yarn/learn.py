@@ -144,7 +144,7 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
     return scene.replace(**changes)
 
 
-def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, steps: int) -> Scene:
+def with_paths(scene: Scene, start: np.ndarray, first: int | Fraction, ratio: Fraction, steps: int) -> Scene:
     """Give a scene the rows of ``pin_path`` and ``forces`` that a model needs whose steps are not the scene's rows.
 
     Row k of a path is of the time from k to k + 1, in rows. The model's step j is of the time from first + j ratio to
@@ -153,14 +153,16 @@ def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, ste
 
     Args:
         scene: the scene, left as it is.
-        start: where the pins are at time 0, before their first row [pins, 3] (m).
-        first: row that the model's first step begins with.
+        start: where the pins are at time 0 and before, ahead of their first row [pins, 3] (m).
+        first: time at which the model's first step begins, a whole number of rows or of the model's steps from one;
+            before time 0 there is the force of row 0.
         ratio: the model's step in rows.
         steps: how many it makes.
     """
     changes: dict[str, Any] = {}
     # as integers over the denominator, so that times of rows are hit exactly
-    times = np.array([first * ratio.denominator + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
+    begin = int(first * ratio.denominator)
+    times = np.array([begin + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
     if scene.pin_path is not None:
         places = np.concatenate([start[None], scene.pin_path]).reshape(len(scene.pin_path) + 1, -1)
         rows = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
@@ -171,7 +173,7 @@ def with_paths(scene: Scene, start: np.ndarray, first: int, ratio: Fraction, ste
         for j, (begin, end) in enumerate(itertools.pairwise(times)):
             rows = np.arange(math.floor(begin), math.ceil(end))
             share = (np.minimum(rows + 1, end) - np.maximum(rows, begin)) / (end - begin)
-            path[j] = np.tensordot(share, scene.force_path[np.minimum(rows, last)], axes=1)
+            path[j] = np.tensordot(share, scene.force_path[np.clip(rows, 0, last)], axes=1)
         forces = enumerate(scene.forces.items())
         changes["forces"] = {node: f if f.ndim == 1 else path[:-1, k] for k, (node, f) in forces}
     return scene.replace(**changes)
@@ -286,9 +288,10 @@ class Task:
         return {name: value for name, value in self.__dict__.items() if name != "rollout"}
 
     def _in_steps(self, scene: Scene, steps_per_frame: int, frames: int) -> Scene:
-        """A scene whose paths go by the model's steps."""
+        """A scene whose paths go by the model's steps. Its runs begin after one step, which ends with the pins at
+        their places in the initial state."""
         ratio = Fraction(self._every, steps_per_frame)
-        return with_paths(scene, self._pins_at_start, self._first, ratio, steps_per_frame * frames)
+        return with_paths(scene, self._pins_at_start, self._first - ratio, ratio, 1 + steps_per_frame * frames)
 
     def halved(self) -> Task:
         """The same task for a model of half the step, with the runs that this one has made."""
@@ -370,7 +373,7 @@ class Task:
     def _run(self, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
         """The residuals of a run."""
         self.simulations += self.cost
-        offset = self.rollout(**inputs).position.double().cpu() - torch.as_tensor(self.positions)
+        offset = self.rollout(**inputs, steps_done=1).position.double().cpu() - torch.as_tensor(self.positions)
         return offset / np.sqrt(len(self.positions) * self.scene.cloth.nodes)
 
     @torch.no_grad()
@@ -469,10 +472,10 @@ class Task:
         # The kernels that learning has compiled, though nothing is differentiated.
         options = {**self.options, "step": self.frame_time / every, "differentiable": True}
         simulator = Simulator(self._in_steps(self.scene_with(values), every, count), **options)
-        simulator.state = self.initial
+        simulator.state, simulator.steps_done = self.initial, 1
         motion = simulator.run(count * every)
         parts = {name: getattr(motion, name)[::every] for name in FIELDS}
-        return dataclasses.replace(motion, step=self.frame_time, **parts)
+        return dataclasses.replace(motion, step=self.frame_time, scene=None, start=0, **parts)
 
 
 # -- the search -------------------------------------------------------------------------------------------------------
