@@ -212,13 +212,14 @@ def test_a_gradient_is_the_same_after_another_one(first: str, then: str, monkeyp
     assert torch.equal(gradient(first), before)
 
 
-def test_a_rollout_that_threads_share_answers_each() -> None:
-    """Each call is one thread's, from its inputs to its frames; nothing else is launched meanwhile."""
+@pytest.mark.parametrize("shared", [True, False])
+def test_rollouts_in_threads_answer_as_alone(shared: bool) -> None:
+    """One that they share, or one for each call, made by its thread, which captures all of its graphs there."""
     rollout, random = wt.Rollout(scene(), STEPS), np.random.default_rng(3)
     calls = [Call.draw(rollout, random) for _ in range(12)]
     expected = [call.answer(rollout) for call in calls]
     with concurrent.futures.ThreadPoolExecutor(3) as pool:
-        found = list(pool.map(lambda call: call.answer(rollout), calls))
+        found = list(pool.map(lambda call: call.answer(rollout if shared else wt.Rollout(scene(), STEPS)), calls))
     assert all(same(a, b) for a, b in zip(found, expected, strict=True))
 
 

@@ -6,7 +6,6 @@ of a run. A ``Fabric`` is an ``nn.Module`` around it whose parameters are bounde
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ import warp as wp
 from .adjoint import Adjoint
 from .arrays import STATE_TYPES, YARN_PARAMETERS
 from .errors import GradientError, InputError, choice, number, whole
+from .exclusive import ALONE, refuse_recording
 from .scene import Scene
 from .simulator import Simulator
 from .state import FIELDS, State
@@ -106,7 +106,6 @@ class Rollout:
         self.device = wp.device_to_torch(self.simulator.model.device)
         self._defaults = self._scene_values()
         self._adjoint: Adjoint | None = None
-        self._lock = threading.RLock()  # a run and its frames are one thread's until it has them
 
     def __getstate__(self) -> dict[str, Any]:
         made_of = {"scene": self.scene, "steps": self.steps, "frames": self.frames}
@@ -195,21 +194,11 @@ class Rollout:
             values["euler_velocity"] = values["euler_velocity"] * crossing[:, None]
         if "euler" in values:
             values.setdefault("anchor", values["euler"])
-        with self._lock:
+        with self.simulator.lock:  # a run and its frames are one thread's until it has them
             if torch.is_grad_enabled() and any(value.requires_grad for value in values.values()):
                 return Frames(*_Run.apply(self, tuple(values), steps_done, *values.values()))
             values = {name: value.detach() for name, value in values.items()}
             return Frames(**self._run(values, steps_done, differentiable=False)[0])
-
-    def _refuse_recording(self) -> None:
-        """Of what a run launches, a tape or a capture would get the first time's, or nothing."""
-        if self.simulator.model.device.is_capturing:
-            raise InputError("a Rollout cannot be captured in a graph: call it outside of the capture")
-        try:
-            with wp.Tape():
-                pass
-        except RuntimeError as error:
-            raise InputError("a Rollout cannot be recorded by a wp.Tape: torch differentiates it") from error
 
     def _checked(self, name: str, value: Any) -> torch.Tensor:
         shapes = self.inputs
@@ -246,7 +235,7 @@ class Rollout:
             _flat(target)[: value.numel()].copy_(value.reshape(-1))
         simulator.state = State(*(given[name].cpu().numpy() for name in FIELDS))
         simulator.steps_done = steps_done
-        simulator.split_steps = {}
+        simulator.split_steps, simulator.damped_steps = {}, set()
         # an interrupted run may have left these
         arrays.zero("status")
         simulator.integrator.set_times(simulator.step_size, simulator.step_size)
@@ -267,8 +256,9 @@ class Rollout:
             The frames that the call returns, and the states that the backward pass starts from. They share no memory:
             a frame that is changed in place would turn the gradient.
         """
-        self._refuse_recording()
-        self._upload(values, steps_done)
+        with ALONE:
+            refuse_recording(self.simulator.model.device)
+            self._upload(values, steps_done)
         simulator, nodes, every = self.simulator, self.scene.cloth.nodes, self.checkpoint_every
         moving = [name for name in FIELDS if simulator.moves(name)]
         checkpoints = -(-self.steps // every) + (every == 1)
@@ -289,13 +279,14 @@ class Rollout:
                 self._refuse_split_steps(steps_done)
             if made < asked:
                 simulator.fail(done + made + 1, simulator.chunk_trajectory(made + 1))
-            if every == 1:
-                self._store(kept, np.arange(made + 1), done)
-            else:
-                self._store(kept, np.arange(1), done // every)
             inside = np.flatnonzero((self.frames >= done + (done > 0)) & (self.frames <= done + made))
-            if len(inside):
-                self._store(result, self.frames[inside] - done, int(inside[0]))
+            with ALONE:
+                if every == 1:
+                    self._store(kept, np.arange(made + 1), done)
+                else:
+                    self._store(kept, np.arange(1), done // every)
+                if len(inside):
+                    self._store(result, self.frames[inside] - done, int(inside[0]))
             done += made
         given = {**self._defaults, **values}
         frames = {
@@ -324,7 +315,7 @@ class Rollout:
     ) -> list[torch.Tensor]:
         """Gradients of the wanted inputs, from those of the frames."""
         _refuse_transforms(*losses.values())
-        self._refuse_recording()
+        refuse_recording(self.simulator.model.device)
         self._upload(values, steps_done)
         simulator, every = self.simulator, self.checkpoint_every
         adjoint = self._adjoint_of(wanted)
@@ -337,7 +328,6 @@ class Rollout:
             else:
                 self._restart(kept, first)
                 simulator.steps_done = steps_done + first
-                simulator.model.forget_energy()
                 simulator.run_chunk(steps)
             self._set_losses(losses, first, steps)
             adjoint.backward_chunk(first, steps, steps_done)
@@ -485,7 +475,7 @@ class _Gradient(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         losses = dict(zip(FIELDS, tensors, strict=False))
         values = dict(zip(run.names, tensors[len(FIELDS) :], strict=True))
-        with run.rollout._lock:
+        with run.rollout.simulator.lock, ALONE:
             return tuple(run.rollout._backward(values, run.steps_done, kept, run.wanted, losses))
 
     @staticmethod
