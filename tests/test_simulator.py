@@ -397,6 +397,9 @@ def test_replace_makes_what_the_arguments_would_have():
     assert scene.wind is not None and "wind" in scene.terms
     chosen = scene.replace(terms=["stretch"])
     assert chosen.replace(gravity=None).terms == ("mass", "stretch")
+    critical = wy.fabrics.cotton(3, 3)  # a damping that follows the other numbers, until it is given
+    assert critical.replace(friction_stiffness=4e3).friction_damping == pytest.approx(2 * critical.friction_damping)
+    assert critical.replace(friction_damping=1.0).replace(friction_stiffness=4e3).friction_damping == 1.0
     thin = scene.cloth.replace(radius=1e-4)
     assert (thin.radius, thin.spacing, thin.yarns) == (1e-4, scene.cloth.spacing, scene.cloth.yarns)
     assert scene.cloth.replace(spacing=2e-3).position[1, 0] == 2e-3  # the pose is upright, whatever the spacing

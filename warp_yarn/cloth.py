@@ -154,10 +154,11 @@ class Cloth(Fixed):
         self.shear = number("shear", shear, least=0.0)
         self.friction = number("friction", friction, least=0.0)
         self.friction_stiffness = number("friction_stiffness", friction_stiffness, above=0.0)
-        if friction_damping is None:
+        damping = friction_damping
+        if damping is None:
             mass = np.mean([self.yarns[k].density for k in self.material]) * self.spacing
-            friction_damping = 2.0 * float(np.sqrt(self.friction_stiffness * mass))
-        self.friction_damping = number("friction_damping", friction_damping, least=0.0)
+            damping = 2.0 * float(np.sqrt(self.friction_stiffness * mass))
+        self.friction_damping = number("friction_damping", damping, least=0.0)
         self.friction_sharpness = number("friction_sharpness", friction_sharpness, above=0.0)
         self.parallel_stiffness = number("parallel_stiffness", parallel_stiffness, least=0.0)
         self.position = self._pose(pose)
@@ -166,7 +167,8 @@ class Cloth(Fixed):
             yarns=self.yarns,
             warp=None if warp is None else self.warp,
             weft=None if weft is None else self.weft,
-            **{name: getattr(self, name) for name in CLOTH_NUMBERS},
+            **{name: getattr(self, name) for name in CLOTH_NUMBERS if name != "friction_damping"},
+            friction_damping=None if friction_damping is None else self.friction_damping,
             pose=pose if isinstance(pose, str) else self.position,
         )
 

@@ -128,5 +128,6 @@ def refuse_recording(device: Any) -> None:
     """
     if device.is_capturing:
         raise InputError("a graph capture of Warp is open: a simulator captures its own, so use it outside")
-    if wp._src.context.runtime.tape is not None:
+    runtime: Any = wp._src.context.runtime
+    if runtime.tape is not None:
         raise InputError("a wp.Tape is open: it would not see a simulation; for gradients use warp_yarn.torch")

@@ -161,12 +161,12 @@ def with_paths(scene: Scene, start: np.ndarray, first: int | Fraction, ratio: Fr
     """
     changes: dict[str, Any] = {}
     # as integers over the denominator, so that times of rows are hit exactly
-    begin = int(first * ratio.denominator)
-    times = np.array([begin + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
+    origin = int(first * ratio.denominator)
+    times = np.array([origin + j * ratio.numerator for j in range(steps + 1)]) / ratio.denominator
     if scene.pin_path is not None:
         places = np.concatenate([start[None], scene.pin_path]).reshape(len(scene.pin_path) + 1, -1)
-        rows = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
-        changes["pin_path"] = np.stack(rows, axis=1).reshape(steps, -1, 3)
+        moves = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
+        changes["pin_path"] = np.stack(moves, axis=1).reshape(steps, -1, 3)
     if len(scene.force_path) > 1:
         last = len(scene.force_path) - 1
         path = np.zeros((steps + 1, *scene.force_path.shape[1:]))
@@ -621,7 +621,7 @@ def learn(
     try:
         return _iterate(search, iterations, path, progress, watch)
     except BaseException as error:
-        error.iterations = list(search.history)
+        error.iterations = list(search.history)  # type: ignore[attr-defined]
         raise
 
 

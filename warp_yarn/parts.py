@@ -43,7 +43,8 @@ class Parts:
 
     def __init__(self, model: Model, method: Any, allowed: float | None, fallback: Callable[[], Any] | None = None):
         self.model, self.method, self.allowed = model, method, allowed
-        self._make_fallback, self._fallback = fallback, None
+        self._make_fallback: Any = fallback
+        self._fallback: Any = None
         self.reset()
         self._graphs = Graphs(model.device)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -119,7 +119,7 @@ def _read(file: h5py.File) -> Published:
         )
         for k in (1, 2)
     ]
-    frames = _frames(file, width, length)
+    frames: dict[str, Any] = _frames(file, width, length)
     cloth = Cloth(
         weave,
         yarns=yarns,

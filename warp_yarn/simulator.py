@@ -237,6 +237,13 @@ class Simulator:
         """The present state, as a copy; setting it checks shapes, finiteness and that crossings are in order."""
         return self._state()
 
+    @state.setter
+    @_alone
+    def state(self, state: State) -> None:
+        state = _checked(state, self.scene.cloth.nodes)
+        self._check_order(state)
+        self._begin_from(state)
+
     def _state(self) -> State:
         nodes = self.scene.cloth.nodes
         values: dict[str, Any] = {}
@@ -249,13 +256,6 @@ class Simulator:
         if values["anchor"] is None:
             values["anchor"] = values["euler"].copy()
         return State(**values)
-
-    @state.setter
-    @_alone
-    def state(self, state: State) -> None:
-        state = _checked(state, self.scene.cloth.nodes)
-        self._check_order(state)
-        self._begin_from(state)
 
     @property
     @_alone
@@ -303,17 +303,17 @@ class Simulator:
         self._pay()
 
     def _pay(self) -> None:
-        self._owed()
-        self._owed = None
+        if self._owed is not None:
+            self._owed()
+            self._owed = None
 
     def _settle(self) -> None:
         """Finishes or takes back what an exception left half done. It may come again meanwhile: then this begins
         anew."""
         self._end_team()
         if self._chunk is not None:
-            self._close_chunk(self._frames_made())
-        if self._owed is not None:
-            self._pay()
+            self._close_chunk(self._chunk, self._frames_made())
+        self._pay()
 
     def _frames_made(self) -> int:
         """How many steps of the chunk are whole."""
@@ -322,9 +322,9 @@ class Simulator:
         failed = int(self.arrays["status"].numpy()[2])
         return failed - 1 if failed else int(self.arrays["counters"].numpy()[0])
 
-    def _close_chunk(self, made: int) -> None:
+    def _close_chunk(self, base: int, made: int) -> None:
         """Ends a chunk after so many whole steps, and keeps its frames if a run asks for them."""
-        base, parted = self._chunk, self._step_in_parts
+        parted = self._step_in_parts
         if parted is not None:
             self.parts.size, self.parts.made, self.parts.rejected, self.parts.damped = parted.parts
             self.split_steps.pop(base + parted.frame + 1, None)
@@ -413,7 +413,7 @@ class Simulator:
             if self.step_error is None:
                 made += self._advance(steps - made)
             if made < steps and not self._make_in_parts(made):
-                self._close_chunk(made)
+                self._close_chunk(base, made)
                 return made
             made = min(made + 1, steps)
         self._keep_frames(base, made)

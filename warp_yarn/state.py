@@ -189,10 +189,13 @@ class Trajectory:
                 frames = len(np.atleast_1d(data["position"]))
                 if not frames:
                     raise InputError("has no frame, must have at least one")
+                values: dict[str, Any] = {
+                    name: finite_array(name, data[name], (frames, cloth.nodes, WIDTHS[name])) for name in FIELDS
+                }
                 return cls(
                     cloth,
                     number("step", data["step"].item(), above=0.0),
-                    *(finite_array(name, data[name], (frames, cloth.nodes, WIDTHS[name])) for name in FIELDS),
+                    **values,
                     scene=_unpacked(cloth, data) if "scene_terms" in data else None,
                     start=whole("start", data["start"].item(), least=0) if "start" in data else 0,
                 )
@@ -225,7 +228,7 @@ def _packed(scene: Scene) -> dict[str, Any]:
 def _unpacked(cloth: Cloth, data: Any) -> Scene:
     """The scene that ``_packed`` made arrays of."""
 
-    def value(name: str) -> np.ndarray | None:
+    def value(name: str) -> Any:
         return data.get(f"scene_{name}")
 
     wind, stiffness = value("wind"), value("pin_stiffness")

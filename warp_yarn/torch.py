@@ -112,7 +112,7 @@ class Rollout:
         return {**made_of, "checkpoint_every": self.checkpoint_every, **self._options}
 
     def __setstate__(self, made_of: dict[str, Any]) -> None:
-        self.__init__(**made_of)
+        Rollout.__init__(self, **made_of)
 
     def _are_in_order(self) -> bool:
         frames = self.frames.astype(object)  # no unsigned differences
@@ -375,7 +375,8 @@ class Rollout:
         array = arrays[ARRAY_OF_PATH.get(name, name)]
         if name in ARRAY_OF_PATH and value.ndim == 3:
             array = arrays[f"{ARRAY_OF_PATH[name]}_path"]
-        repeated = None if losses.get(name) is None else losses[name].sum(dim=0)
+        loss = losses.get(name)
+        repeated = None if loss is None else loss.sum(dim=0)
         if array is None:  # a part of the state that this scene does not have: every frame repeats it
             return torch.zeros_like(value) if repeated is None else repeated
         gradient = _flat(array.grad)[: value.numel()].reshape(value.shape).clone()
