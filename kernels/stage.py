@@ -147,23 +147,33 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_rhs: wp.array(dtype=scalar),
         direction: wp.array(dtype=vec3),
         euler_direction: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
+        solution: wp.array(dtype=vec3),
+        euler_solution: wp.array(dtype=scalar),
+        base_velocity: wp.array(dtype=vec3),
+        base_euler_velocity: wp.array(dtype=scalar),
         slope: wp.array(dtype=scalar),
         kinetic: wp.array(dtype=scalar),
         step_length: wp.array(dtype=scalar),
     ):
-        """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, and δ·M δ."""
+        """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, and of the change of velocity
+        g = w + δ − v₀ that it leads to, g·M g."""
         total = scalar(0.0)
         square = scalar(0.0)
         for i in range(nodes):
             d = at(direction, i)
             total += wp.dot(at(rhs, i), d)
+            gain = vec3()
+            if is_free[i] != 0:
+                gain = at(solution, i) + d - at(base_velocity, i)
             along = scalar(0.0)
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
                     d_s = at(euler_direction, s)
                     total += at(euler_rhs, s) * d_s
-                    along += scalar(0.5) * d_s * d_s
-            square += at(node_mass, i) * (wp.dot(d, d) + along)
+                    gain_s = at(euler_solution, s) + d_s - at(base_euler_velocity, s)
+                    along += scalar(0.5) * gain_s * gain_s
+            square += at(node_mass, i) * (wp.dot(gain, gain) + along)
         slope[0] = total
         kinetic[0] = square
         step_length[0] = scalar(1.0)
@@ -179,6 +189,7 @@ def define(variant: Variant) -> SimpleNamespace:
         last_norm: wp.array(dtype=scalar),
         contraction: wp.array(dtype=scalar),
         change: wp.array(dtype=scalar),
+        first_change: wp.array(dtype=scalar),
         steps: wp.array(dtype=int),
         finishes: wp.array(dtype=int),
         newton_iterations: wp.array(dtype=int),
@@ -197,19 +208,24 @@ def define(variant: Variant) -> SimpleNamespace:
             left *= contraction[0]
         elif stage == 0:
             # not known of a time step's first
-            change[0] = wp.sqrt(kinetic[0])
             left = scalar(1.0)
         else:
             # that of the stage before, whose matrix this one begins with
-            change[0] = wp.max(change[0], wp.sqrt(kinetic[0]))
             left *= contraction[0] * scalar(CAUTION)
+        # not of the first δ, of which the line search may take little
+        change[0] = wp.sqrt(kinetic[0])
+        if stage == 0:
+            first_change[0] = change[0]
+        else:
+            change[0] = wp.max(change[0], first_change[0])
         steps[0] = steps[0] + 1
         last_norm[0] = norm
         newton_iterations[0] = newton_iterations[0] + 1
         if status[0] == 0:
             residual[0] = norm / wp.max(change[0], scalar(1.0e-30))
         finishes[0] = 0
-        if norm == scalar(0.0) or (step_length[0] == scalar(1.0) and left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]):
+        small = left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]
+        if norm == scalar(0.0) or (step_length[0] == scalar(1.0) and small):
             finishes[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)

@@ -53,7 +53,7 @@ class StageMethod:
         vectors = ("base_position", "base_velocity", "increment", "direction", "solution_before")
         rates = ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before")
         numbers = (
-            "size", "slope", "contraction", "kinetic", "last_norm", "change",
+            "size", "slope", "contraction", "kinetic", "last_norm", "change", "first_change",
             "stage_size", "carried_time", "carried_rate", "newton_tolerance",
         )  # fmt: skip
         counts = ("tries", "steps", "continues", "finishes", "solves", "refreshes", "crosses", "newton_iterations")
