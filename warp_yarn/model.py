@@ -29,6 +29,8 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
+AT_END = 2
+"""The place of a step's end among ``stage_times``, behind those of two stages."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
 CHEAP_ENERGIES = {
@@ -191,8 +193,8 @@ class Model:
         a = self.arrays
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
-        reached = [1.0 if self.held else begun + time * step / self.step_size for time in times]
-        a.put("stage_times", *reached, *[1.0] * (2 - len(reached)))
+        reached = [1.0 if self.held else begun + time * step / self.step_size for time in (*times, 1.0)]
+        a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)))
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("weights", 1.0, stage, stage * stage)
@@ -333,6 +335,9 @@ class Model:
         """What every method ends a step with, its end state in place: checks and moves on, and records the frame."""
         if self.scene.sliding:
             self.launch("check_order", "segments")
+        if "pin_motion" in self.arrays:
+            # pins are looked at where they are now, not where they were at the last stage's time
+            self.take_inputs(AT_END)
         if self.watches:
             self._close_step()
         self.drag_anchor("euler", "anchor")
