@@ -158,7 +158,7 @@ class Arrays(dict[str, Any]):
         self["weights"] = self.zeros(1, vec3)
         self["step_size"] = self.zeros(1, scalar)
         self["remaining"] = self.zeros(1, scalar)
-        self["stage_times"] = self.zeros(3, scalar)
+        self["stage_times"] = self.zeros(4, scalar)
 
     def add_levels(self) -> None:
         """Makes room for the multilevel preconditioner: its index arrays, and what it factorizes."""

@@ -29,8 +29,8 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-AT_END = 2
-"""The place of a step's end among ``stage_times``, behind those of two stages."""
+AT_END, AT_START = 2, 3
+"""The places of a step's end and start among ``stage_times``, behind those of two stages."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
 CHEAP_ENERGIES = {
@@ -194,7 +194,7 @@ class Model:
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
         reached = [1.0 if self.held else begun + time * step / self.step_size for time in (*times, 1.0)]
-        a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)))
+        a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)), begun)
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("weights", 1.0, stage, stage * stage)
@@ -400,6 +400,8 @@ class Model:
             wp.capture_if(self.arrays["audit_due"], on_true=self._audit)
 
     def _audit(self) -> None:
+        if "pin_motion" in self.arrays:
+            self.take_inputs(AT_START)
         self.press()
         self.arrays.zero("energy", "elastic_energy", "height_energy")
         self._add_energies(cheap=True)
