@@ -6,7 +6,8 @@ E is the whole energy at the last audit, all terms' energies at the beginning of
 ``EVERY`` steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken
 for a gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a
 while after a gain. W is the work of wind, applied forces and moving pins since. The same must hold from the start of the
-run on.
+run on. A method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a
+step, the power at the step's ends says nothing of it.
 
 A run that fails here would blow up, or be wrong without saying so.
 """
@@ -86,6 +87,16 @@ def define(variant: Variant) -> SimpleNamespace:
         wp.atomic_add(power, 0, wp.dot(pull, pin_motion[e]) / step_duration)
 
     @wp.kernel(module=module, enable_backward=False)
+    def add_work(
+        share: scalar,
+        step_size: wp.array(dtype=scalar),
+        power: wp.array(dtype=scalar),
+        stage_work: wp.array(dtype=scalar),
+    ):
+        """Work of a stage's power, which makes its share of the step."""
+        stage_work[0] += share * step_size[0] * power[0]
+
+    @wp.kernel(module=module, enable_backward=False)
     def suspect(
         energy: wp.array(dtype=scalar),
         elastic_energy: wp.array(dtype=scalar),
@@ -105,6 +116,8 @@ def define(variant: Variant) -> SimpleNamespace:
         elastic_energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
         power: wp.array(dtype=scalar),
+        by_stages: int,
+        stage_work: wp.array(dtype=scalar),
         still_energy: wp.array(dtype=scalar),
         step_size: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
@@ -118,6 +131,9 @@ def define(variant: Variant) -> SimpleNamespace:
         if status[0] == 0:
             # the larger power of the step's two ends: between them it may have been either
             work = wp.max(power[0], bounds[3]) * step_size[0]
+            if by_stages != 0:
+                # what the method itself makes of it
+                work = stage_work[0]
             inner = energy[0] + elastic_energy[0]
             total = inner + height_energy[0]
             room = scalar(GAIN) * wp.max(inner, bounds[2]) + still_energy[0]
@@ -140,5 +156,10 @@ def define(variant: Variant) -> SimpleNamespace:
                 audit_due[0] = wp.where(steps_to_audit[0] <= 0, 1, 0)
 
     return SimpleNamespace(
-        audit=audit, add_power=add_power, add_pin_power=add_pin_power, suspect=suspect, close_step=close_step
+        audit=audit,
+        add_power=add_power,
+        add_pin_power=add_pin_power,
+        add_work=add_work,
+        suspect=suspect,
+        close_step=close_step,
     )

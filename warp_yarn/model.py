@@ -331,15 +331,19 @@ class Model:
         if a["anchor"] is not None:
             self.launch("drag_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
 
-    def end_step(self) -> None:
-        """What every method ends a step with, its end state in place: checks and moves on, and records the frame."""
+    def end_step(self, *, by_stages: bool = False) -> None:
+        """What every method ends a step with, its end state in place: checks and moves on, and records the frame.
+
+        Args:
+            by_stages: whether the method has added up the work of its stages (``add_work``).
+        """
         if self.scene.sliding:
             self.launch("check_order", "segments")
         if "pin_motion" in self.arrays:
             # pins are looked at where they are now, not where they were at the last stage's time
             self.take_inputs(AT_END)
         if self.watches:
-            self._close_step()
+            self._close_step(by_stages)
         self.drag_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
@@ -378,7 +382,7 @@ class Model:
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
         self.watches = not (self.held and self.scene.pin_path is not None)
-        for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 1), ("bounds", 5)):
+        for name, count in (("energy", 1), ("elastic_energy", 1), ("height_energy", 1), ("power", 1), ("stage_work", 1), ("bounds", 5)):
             a[name] = a.zeros(count, a.variant.scalar)
         for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
             a[name] = a.zeros(1, wp.int32)
@@ -415,13 +419,20 @@ class Model:
                 energy = self.arrays[CHEAP_ENERGIES.get(term.name, "energy")]
                 self.launch(f"{term.name}_energy", term.elements, energy=energy)
 
-    def _close_step(self) -> None:
-        """Compares the energy at the end of a step with the work done in it."""
+    def begin_work(self) -> None:
+        """Begins to add up the work done in a step."""
+        self.arrays.zero("stage_work")
+
+    def add_work(self, share: float) -> None:
+        """Adds the work that is done at the present state in a share of the step."""
+        if self.watches:
+            self.arrays.zero("power")
+            self._add_power()
+            self.launch("add_work", 1, share=share)
+
+    def _add_power(self) -> None:
+        """Power of what does work on the cloth."""
         a = self.arrays
-        a.zero("energy", "elastic_energy", "height_energy", "power")
-        self._add_energies(cheap=True)
-        self.launch("suspect", 1)
-        wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
         for term in a.terms:
             if term.name in OUTER_FORCES:
                 a.zero("q_x")
@@ -429,4 +440,14 @@ class Model:
                 self.launch("add_power", "nodes", force=a["q_x"])
         if "pin_motion" in a and not self.held:
             self.launch("add_pin_power", "pins", step_duration=self.step_size)
-        self.launch("close_step", 1)
+
+    def _close_step(self, by_stages: bool) -> None:
+        """Compares the energy at the end of a step with the work done in it."""
+        a = self.arrays
+        a.zero("energy", "elastic_energy", "height_energy", "power")
+        self._add_energies(cheap=True)
+        self.launch("suspect", 1)
+        wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
+        if not by_stages:
+            self._add_power()
+        self.launch("close_step", 1, by_stages=int(by_stages))
