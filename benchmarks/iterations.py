@@ -12,7 +12,8 @@ the cloth has; where sliding is on, so are friction and all that goes with it.
                 along their yarns, at stages of 0.3 ms, 2 ms and 1/60 s, locked and sliding
 
 "to r" is until √(r·P⁻¹r) is 1e-6 of what it is at the start, as the simulator's ``tolerance`` says; "to b" until it is
-1e-6 of √(b·P⁻¹b), which takes fewer where velocities are near the solution. "> n" where it takes more.
+1e-6 of √(b·P⁻¹b), which takes fewer where velocities are near the solution. "> n" where it takes more than --most, or
+ends before because p·A p is no longer above 0.
 """
 
 from __future__ import annotations
@@ -90,8 +91,8 @@ def _norm(simulator: wy.Simulator) -> float:
     return float(total)
 
 
-def count(scene: wy.Scene, state: wy.State, length: float, preconditioner: str, most: int) -> dict[str, int]:
-    """Count the iterations that a system takes, "to r" and "to b"."""
+def count(scene: wy.Scene, state: wy.State, length: float, preconditioner: str, most: int) -> dict[str, int | str]:
+    """Count the iterations that a system takes, "to r" and "to b"; or say after how many it ended without success."""
     simulator = wy.Simulator(
         scene, step=length, integrator="linear", preconditioner=preconditioner, max_iterations=most
     )
@@ -116,10 +117,12 @@ def count(scene: wy.Scene, state: wy.State, length: float, preconditioner: str, 
         start(moving)
         solve(0, TOLERANCE)
         sizes.append(_norm(simulator))
-    result = {}
+    result: dict[str, int | str] = {}
     for name, tolerance in (("to r", TOLERANCE), ("to b", TOLERANCE * np.sqrt(sizes[0] / sizes[1]))):
         start(True)
         result[name] = solve(most, tolerance)
+        if a["status"].numpy()[0]:
+            result[name] = f"> {result[name]}"
     return result
 
 
@@ -131,7 +134,7 @@ def row(
     for preconditioner, (name, length) in itertools.product(PRECONDITIONERS, lengths.items()):
         found = count(scene, state, length, preconditioner, most)
         for to, iterations in found.items():
-            result[f"{preconditioner}, {name}, {to}"] = iterations if iterations < most else f"> {most}"
+            result[f"{preconditioner}, {name}, {to}"] = iterations
     return result
 
 

@@ -217,7 +217,7 @@ def test_no_false_alarm(acts, fabric, sliding):
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "sdirk2"])
 def test_no_false_alarm_with_other_methods(method):
-    # of a spring that moves, ros2 has no stage whose work is its own: its alarms there may be false, and steps are split
+    # ros2 has no stage whose work is its own: where springs move its alarms may be false, and steps are split
     for acts in (still, falling, hung, windy, gusty, *([] if method == "ros2" else [eased])):
         # steps that resolve the paper's cloth, where no method gains
         with_it = watched("paper", acts, method, False, watches=True, step=2e-4)
