@@ -47,21 +47,19 @@ def define(variant: Variant) -> SimpleNamespace:
         # and its yarns' energy
         elastic_energy: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
-        begun: wp.array(dtype=int),
         steps_to_audit: wp.array(dtype=int),
         audit_due: wp.array(dtype=int),
     ):
         """Takes all of the energy at the beginning of a step for E."""
         total = energy[0] + elastic_energy[0] + height_energy[0]
-        if begun[0] == 0:
+        # a run that has not made a step has no power yet
+        if bounds[3] < scalar(-1.0e30):
             bounds[0] = total
             bounds[1] = total
+            bounds[4] = elastic_energy[0]
         else:
             bounds[0] = wp.min(bounds[0], total)
         bounds[2] = energy[0] + elastic_energy[0]
-        if begun[0] == 0:
-            bounds[4] = elastic_energy[0]
-        begun[0] = 1
         steps_to_audit[0] = wp.static(EVERY)
         audit_due[0] = 0
 

@@ -403,7 +403,7 @@ class Model:
             ("bounds", 5),
         ):
             a[name] = a.zeros(count, a.variant.scalar)
-        for name in ("begun", "steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
+        for name in ("steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
             a[name] = a.zeros(1, wp.int32)
         cloth = self.scene.cloth
         lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
@@ -413,7 +413,7 @@ class Model:
 
     def forget_energy(self) -> None:
         """Begins to watch anew, from the present state on."""
-        for name, value in (("begun", 0), ("audit_due", 1), ("alert", 0)):
+        for name, value in (("audit_due", 1), ("alert", 0)):
             self.arrays.put(name, value)
         self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0)
 

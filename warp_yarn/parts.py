@@ -106,6 +106,8 @@ class Parts:
         """Goes back to where the part started."""
         self.model.arrays.zero("status")
         self._copy("", "kept_")
+        # the bounds of energy may be those from before the run's first audit
+        self.model.arrays.put("audit_due", 1)
 
     def _accepts(self, method: Any, size: float) -> bool:
         """Whether the part is good; says what size the next is to have."""
