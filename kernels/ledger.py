@@ -5,9 +5,9 @@
 E is the whole energy at the last audit, all terms' energies at the beginning of a step, which is made every
 ``EVERY`` steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken
 for a gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a
-while after. W is the work of wind, applied forces and moving pins since. The same must hold from the run's start on. A
-method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a step, the
-power at the step's ends says nothing of it.
+while after. W is the work of wind, applied forces and moving pins since. The same must hold from the run's start on.
+A method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a step,
+the power at the step's ends says nothing of it.
 
 g is ``GAIN`` where a method makes a step that gains again, damped. A method that does not damp, and a run that must
 have a gradient, are stopped only where energy doubles: they would blow up, or be wrong without saying so.
@@ -166,7 +166,7 @@ def define(variant: Variant) -> SimpleNamespace:
             else:
                 bounds[0] += work
                 bounds[1] += work
-                bounds[3] = last
+                bounds[3] = power[0]
                 bounds[4] = elastic_energy[0]
                 alert[0] = wp.max(alert[0] - 1, 0)
                 steps_to_audit[0] = steps_to_audit[0] - 1

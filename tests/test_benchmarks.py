@@ -705,7 +705,7 @@ def test_work_of_pins_and_wind_is_counted(exact):
     }  # fmt: skip
     case = dataclasses.replace(defaults.Case.of(3), **found)
     run = defaults.Run.of(case, integrator="implicit-midpoint", **defaults.TIGHT)
-    total, inner, work = defaults.energies(case, run.simulator, run.frames)
+    total, _, work = defaults.energies(case, run.simulator, run.frames)
     gained = total - total[0]
     # of gravity, and of air that takes the cloth along
     assert np.abs(work).max() > 0.5 * np.abs(gained).max() > 1e-9
