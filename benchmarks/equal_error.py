@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -31,9 +32,12 @@ MOST_STEPS = 8192
 
 
 def error(motion: Motion, size: int, method: str, steps: int, converged: Reference) -> float:
-    """Of the motion in so many steps, relative to what moved."""
+    """Of the motion in so many steps, relative to what moved; infinite where a step cannot be made."""
     simulator = motion.simulator(size, step=motion.duration / steps, integrator=method)
-    return converged.error(end(simulator, steps))
+    try:
+        return converged.error(end(simulator, steps))
+    except wy.SimulationError:
+        return math.inf
 
 
 def steps_to(

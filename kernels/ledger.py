@@ -9,8 +9,8 @@ while after. W is the work of wind, applied forces and moving pins since. The sa
 A method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a step,
 the power at the step's ends says nothing of it.
 
-g is ``GAIN`` where a method makes a step that gains again, damped. A method that does not damp, and a run that must
-have a gradient, are stopped only where energy doubles: they would blow up, or be wrong without saying so.
+g is ``GAIN``: what gains more is made again, damped, in parts, or ends the run, for it would be wrong without saying so,
+or blow up. A run that must have a gradient is stopped only where energy doubles, as a step in parts has none.
 """
 
 import functools
@@ -27,11 +27,13 @@ EVERY = 16
 GAIN = 0.01
 """Part of the energy that a step may gain: shear's dependence on the contact force has no energy of its own."""
 BLOW_UP = 1.0
-"""The same of methods that have nothing to fall back on."""
+"""The same of runs that must have a gradient, and of steps that are damped already."""
 SUDDEN = 0.1
 """Part of the energy that yarns give or take in a step that is looked at closely."""
 ALERT = 16
 """Steps after that, or after a gain, that are looked at closely too."""
+UNCERTAIN = 0.5
+"""The same of methods whose work is not known from their stages, eq. 2 and ROS2."""
 STILL = 1.0e-6
 """Speed of the whole cloth whose energy may always be gained [m/s]: rounding."""
 
@@ -46,7 +48,7 @@ def define(variant: Variant) -> SimpleNamespace:
         energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
         # E + W since the last audit, and since the start; energy beside gravity at the last audit; the last step's
-        # power, and its yarns' energy
+        # power, its yarns' energy, and energy beside gravity
         elastic_energy: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
         steps_to_audit: wp.array(dtype=int),
@@ -152,13 +154,18 @@ def define(variant: Variant) -> SimpleNamespace:
                 work = stage_work[0]
             inner = energy[0] + elastic_energy[0]
             total = inner + height_energy[0]
-            room = gain[0] * wp.max(inner, bounds[2]) + still_energy[0]
-            room += scalar(1.0e-9) * wp.abs(height_energy[0])
+            # what there was at the last audit, or at the last step
+            before = wp.max(bounds[2], bounds[5])
+            room = scalar(GAIN) * wp.max(inner, before) + still_energy[0] + scalar(1.0e-9) * wp.abs(height_energy[0])
+            if gain[0] > scalar(GAIN):
+                room += gain[0] * before
+            elif by_stages == 0:
+                room += scalar(UNCERTAIN) * before
             bound = wp.min(bounds[0], bounds[1])
             if damps[0] != 0:
                 # there is no surer method: it only may not blow up
                 bound = bounds[1]
-                room = wp.max(room, scalar(BLOW_UP) * wp.max(inner, bounds[2]))
+                room += scalar(BLOW_UP) * before
             if not (total <= bound + work + room):
                 status[0] = wp.static(GAINED)
                 status[1] = -1
@@ -168,10 +175,11 @@ def define(variant: Variant) -> SimpleNamespace:
                 bounds[1] += work
                 bounds[3] = power[0]
                 bounds[4] = elastic_energy[0]
+                bounds[5] = inner
                 alert[0] = wp.max(alert[0] - 1, 0)
                 steps_to_audit[0] = steps_to_audit[0] - 1
                 # what was dissipated is not to be gained again
-                dissipated = inner < scalar(0.5) * bounds[2]
+                dissipated = inner < scalar(0.1) * bounds[2]
                 audit_due[0] = wp.where(steps_to_audit[0] <= 0 or dissipated, 1, 0)
 
     return SimpleNamespace(

@@ -326,8 +326,9 @@ def define(variant: Variant) -> SimpleNamespace:
                     status[1] = i
         elif stalled and continues[0] != 0:
             continues[0] = 0
-            # what rounding leaves cannot be taken away
-            if not (before <= rounding * scalar(wp.static(ROUNDING))):
+            # what rounding leaves cannot be taken away; nor is there a need to where the last step was small enough
+            small = not first and last_norm[0] <= newton_tolerance[0] * change[0]
+            if not (small or before <= rounding * scalar(wp.static(ROUNDING))):
                 status[0] = wp.static(STALLED)
                 status[1] = -1
 

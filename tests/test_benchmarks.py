@@ -484,14 +484,14 @@ def test_half_the_step_keeps_paths_in_time():
     scene = wy.Scene(cloth, pins=pins, pin_path=path, forces={cloth.node(3, 1): force})
     half = ablation._halved(scene, None)
     whole, fine = wy.Simulator(scene, step=1e-5), wy.Simulator(half, step=5e-6)
-    # what holds a step of the whole holds two of the half: their mean forces are equal at every such step
+    # forces hold for two of the half steps what they hold for one of the whole; pins are where they are, in time
     for _ in range(6):
         whole.run(1)
         targets = whole.arrays["pin_target"].numpy(), whole.arrays["applied_force"].numpy()
         for _ in range(2):
             fine.run(1)
-            np.testing.assert_array_equal(fine.arrays["pin_target"].numpy(), targets[0])
             np.testing.assert_array_equal(fine.arrays["applied_force"].numpy(), targets[1])
+        np.testing.assert_allclose(fine.arrays["pin_target"].numpy(), targets[0], rtol=1e-14)
 
 
 def test_a_still_cloth_has_nothing_to_be_relative_to():

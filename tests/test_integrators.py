@@ -273,7 +273,7 @@ def fails_at_first(simulator: wy.Simulator, largest: float) -> None:
 
 def test_a_step_that_fails_is_made_in_parts() -> None:
     scene, state = colliding(0.2)
-    simulator = wy.Simulator(scene, newton_tolerance=3e-4)
+    simulator = wy.Simulator(scene, newton_tolerance=3e-4, preconditioner="incomplete")
     simulator.state = state
     fails_at_first(simulator, 3e-4)
     trajectory = simulator.run(5)
@@ -283,11 +283,11 @@ def test_a_step_that_fails_is_made_in_parts() -> None:
     fallen = trajectory.position[-1, :, 2].mean() - trajectory.position[0, :, 2].mean()
     assert fallen == pytest.approx(-0.5 * 9.8 * 0.005**2, rel=0.01)
     # they are those of a simulator with their size
-    fine = wy.Simulator(scene, step=2.5e-4, newton_tolerance=3e-4)
+    fine = wy.Simulator(scene, step=2.5e-4, newton_tolerance=3e-4, preconditioner="incomplete")
     fine.state = state
     assert np.array_equal(fine.run(4).position[-1], trajectory.position[1])
     # the next steps are whole again, and are those of a simulator that starts there
-    other = wy.Simulator(scene, newton_tolerance=3e-4)
+    other = wy.Simulator(scene, newton_tolerance=3e-4, preconditioner="incomplete")
     other.state = trajectory[1]
     assert np.array_equal(other.run(4).position, trajectory.position[1:])
 
@@ -337,7 +337,7 @@ def test_a_stage_that_does_not_converge_stops_the_run() -> None:
     simulator = wy.Simulator(wy.Scene(scene.cloth, terms=["inertia"]))
     simulator.state = state
     with pytest.raises(
-        wy.SimulationError, match=r"Newton's iteration stopped .* parts as small as 7\.8e-06 s"
+        wy.SimulationError, match=r"(Newton's iteration stopped|gains energy) .* parts as small as 7\.8e-06 s"
     ) as error:
         simulator.run(2)
     assert len(error.value.trajectory) == error.value.step == 1

@@ -20,7 +20,7 @@ from . import exclusive
 from .arrays import Arrays
 from .errors import InputError, choice, number, whole
 from .kernels import Term, Variant, build
-from .kernels.ledger import BLOW_UP, STILL
+from .kernels.ledger import BLOW_UP, GAIN, STILL
 from .levels import BLOCKS
 from .scene import Scene
 
@@ -393,7 +393,7 @@ class Model:
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
         self.watches = not (self.held and self.scene.pin_path is not None)
-        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 5}
+        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 6}
         for name, count in counts.items():
             a[name] = a.zeros(count, a.variant.scalar)
         for name in ("steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
@@ -404,14 +404,14 @@ class Model:
         a["still_energy"] = a.numbers(0.5 * mass * STILL**2)
         if self._outer:
             a["outer_force"] = a.zeros(a["nodes"], a.variant.vec3)
-        a["gain"] = a.numbers(BLOW_UP)
+        a["gain"] = a.numbers(BLOW_UP if a.variant.reverse else GAIN)
         self.forget_energy()
 
     def forget_energy(self) -> None:
         """Begins to watch anew, from the present state on."""
         for name, value in (("audit_due", 1), ("alert", 0)):
             self.arrays.put(name, value)
-        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0)
+        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0)
 
     def open_step(self) -> None:
         """What every method begins a step with: it looks at the energy, if it is time to."""

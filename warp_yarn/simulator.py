@@ -21,7 +21,6 @@ from .errors import InputError, SimulationError, choice, number, whole
 from .exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from .integrators import INTEGRATORS
 from .kernels import step
-from .kernels.ledger import GAIN
 from .model import Graphs, Model
 from .parts import Parts
 from .scene import Scene
@@ -186,8 +185,6 @@ class Simulator:
             fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](self.model)
             allowed = self.step_error and self.step_error * scene.cloth.spacing
             self.parts = Parts(self.model, self.integrator, allowed, fallback)
-            if fallback is not None and not differentiable:
-                self.arrays.put("gain", GAIN)
             self.chunk = _checked_chunk(chunk, scene.cloth.nodes)
             self.arrays.add_frames(self.chunk + 1)
             self._graphs = Graphs(self.model.device)
