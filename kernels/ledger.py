@@ -6,6 +6,8 @@ E is the whole energy at the last audit, all terms' energies at the beginning of
 ``EVERY`` steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken
 for a gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a
 while after. W is the work of wind, applied forces and moving pins since. The same must hold from the run's start on.
+A method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a step,
+the power at the step's ends says nothing of it.
 
 g is ``GAIN`` where a method makes a step that gains again, damped. A method that does not damp, and a run that must
 have a gradient, are stopped only where energy doubles: they would blow up, or be wrong without saying so.
@@ -47,21 +49,19 @@ def define(variant: Variant) -> SimpleNamespace:
         # power, and its yarns' energy
         elastic_energy: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
-        begun: wp.array(dtype=int),
         steps_to_audit: wp.array(dtype=int),
         audit_due: wp.array(dtype=int),
     ):
         """Takes all of the energy at the beginning of a step for E."""
         total = energy[0] + elastic_energy[0] + height_energy[0]
-        if begun[0] == 0:
+        # a run that has not made a step has no power yet
+        if bounds[3] < scalar(-1.0e30):
             bounds[0] = total
             bounds[1] = total
+            bounds[4] = elastic_energy[0]
         else:
             bounds[0] = wp.min(bounds[0], total)
         bounds[2] = energy[0] + elastic_energy[0]
-        if begun[0] == 0:
-            bounds[4] = elastic_energy[0]
-        begun[0] = 1
         steps_to_audit[0] = wp.static(EVERY)
         audit_due[0] = 0
 
@@ -92,13 +92,24 @@ def define(variant: Variant) -> SimpleNamespace:
         pin_motion: wp.array(dtype=vec3),
         step_duration: scalar,
         position: wp.array(dtype=vec3),
-        stage: int,
-        pin_power: wp.array(dtype=scalar),
+        power: wp.array(dtype=scalar),
     ):
         """Power of moving pins: the force of their springs times their velocity."""
         e = index(wp.tid())
         pull = (pin_target[e] - position[index(pin_node[e])]) * pin_stiffness[0]
-        wp.atomic_add(pin_power, stage, wp.dot(pull, pin_motion[e]) / step_duration)
+        of_pin = wp.dot(pull, pin_motion[e]) / step_duration
+        wp.atomic_add(power, 0, of_pin)
+        wp.atomic_add(power, 1, of_pin)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_work(
+        share: scalar,
+        step_size: wp.array(dtype=scalar),
+        power: wp.array(dtype=scalar),
+        stage_work: wp.array(dtype=scalar),
+    ):
+        """Work of a stage's power, which makes its share of the step."""
+        stage_work[0] += share * step_size[0] * power[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def suspect(
@@ -120,9 +131,9 @@ def define(variant: Variant) -> SimpleNamespace:
         elastic_energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
         power: wp.array(dtype=scalar),
-        pin_power: wp.array(dtype=scalar),
-        first_share: scalar,
         gain: wp.array(dtype=scalar),
+        by_stages: int,
+        stage_work: wp.array(dtype=scalar),
         still_energy: wp.array(dtype=scalar),
         step_size: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
@@ -135,11 +146,10 @@ def define(variant: Variant) -> SimpleNamespace:
         """Compares the end of a step with the bounds, which move on if the step is good."""
         if status[0] == 0:
             # methods take the force or the velocity of either end: the largest that the power may have been
-            last = power[0] + pin_power[1]
-            most = wp.max(wp.max(last, power[1] + pin_power[1]), bounds[3])
-            # pins that start at once push in the first stage
-            most = wp.max(most, last + first_share * (pin_power[0] - pin_power[1]))
-            work = most * step_size[0]
+            work = wp.max(wp.max(power[0], power[1]), bounds[3]) * step_size[0]
+            if by_stages != 0:
+                # what the method itself makes of it
+                work = stage_work[0]
             inner = energy[0] + elastic_energy[0]
             total = inner + height_energy[0]
             room = gain[0] * wp.max(inner, bounds[2]) + still_energy[0]
@@ -156,7 +166,7 @@ def define(variant: Variant) -> SimpleNamespace:
             else:
                 bounds[0] += work
                 bounds[1] += work
-                bounds[3] = last
+                bounds[3] = power[0]
                 bounds[4] = elastic_energy[0]
                 alert[0] = wp.max(alert[0] - 1, 0)
                 steps_to_audit[0] = steps_to_audit[0] - 1
@@ -169,6 +179,7 @@ def define(variant: Variant) -> SimpleNamespace:
         add_power=add_power,
         keep_outer_force=keep_outer_force,
         add_pin_power=add_pin_power,
+        add_work=add_work,
         suspect=suspect,
         close_step=close_step,
     )

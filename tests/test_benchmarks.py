@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import sys
 
 import numpy as np
@@ -21,6 +22,8 @@ sizes = load("benchmarks/sizes.py")
 bandwidth = load("benchmarks/bandwidth.py")
 terms = load("benchmarks/terms.py")
 terms_scene = load("scenes/terms.py")
+defaults = load("benchmarks/defaults.py")
+iterations = load("benchmarks/iterations.py")
 motions = sys.modules["motions"]
 
 
@@ -675,3 +678,89 @@ def test_a_long_run_calms_down_and_its_faults_are_seen():
     grown = [{**row, "energy [J]": k * 1e-9, "memory [MB]": float(k)} for k, row in enumerate(rows)]
     assert [fault.split()[0] for fault in long_run.faults(grown)] == ["energy", "memory"]
     assert "not finite" in long_run.faults([{**rows[0], "finite": False}])[0]
+
+
+# -- benchmarks/defaults.py --------------------------------------------------------------------------------------------
+
+
+def test_a_random_scene_is_known_by_its_number():
+    cases = [defaults.Case.of(number) for number in range(60)]
+    assert cases == [defaults.Case.of(number) for number in range(60)]
+    assert {case.kind for case in cases} == set(defaults.KINDS)
+    assert {(case.kind, case.fabric) for case in cases} == set(itertools.product(defaults.KINDS, wy.fabrics.FABRICS))
+    assert {case.weave for case in cases} == set(wy.WEAVES)
+    assert {case.sliding for case in cases} == {case.exact for case in cases} == {False, True}
+    assert min(case.stretch for case in cases) < 0.1
+    assert max(case.stretch for case in cases) > 1e3
+    assert min(case.step for case in cases) < 2e-4
+    assert max(case.step for case in cases) > 1.0 / 30.0
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_work_of_pins_and_wind_is_counted(exact):
+    """Of a converged motion nothing is left beside energy and work but what the method damps; carried, and in wind."""
+    found = {
+        "kind": "carried", "fabric": "paper", "rows": 4, "columns": 4, "stretch": 1.0, "step": 1e-4, "steps": 8,
+        "sliding": False, "exact": exact, "wind": (3.0, 4.0, 0.0), "speed": (1.0, 2.0, -0.5), "strain": 0.0,
+    }  # fmt: skip
+    case = dataclasses.replace(defaults.Case.of(3), **found)
+    run = defaults.Run.of(case, integrator="implicit-midpoint", **defaults.TIGHT)
+    total, _, work = defaults.energies(case, run.simulator, run.frames)
+    gained = total - total[0]
+    # of gravity, and of air that takes the cloth along
+    assert np.abs(work).max() > 0.5 * np.abs(gained).max() > 1e-9
+    # the quadrature over a step, of order 4, and friction of none
+    np.testing.assert_allclose(gained, work, rtol=0.0, atol=0.02 * np.abs(work).max())
+
+
+def test_a_row_of_the_defaults_from_the_command(tmp_path):
+    path = tmp_path / "defaults.csv"
+    defaults.main(["--scenes", "2", "--first", "2", "--output", str(path)])
+    with open(path, newline="") as file:
+        hung, carried = csv.DictReader(file)
+    assert (hung["kind"], carried["kind"]) == ("hung", "carried")
+    for row in (hung, carried):
+        assert not row["failure"]
+        assert float(row["ratio"]) < 0.2
+        assert float(row["gain"]) < 0.01
+
+
+def test_a_scene_that_fails_says_so(monkeypatch):
+    def fail(*_):
+        raise wy.SimulationError("step 1: no", step=1, node=-1, term=None, trajectory=None)
+
+    monkeypatch.setattr(defaults.wy.Simulator, "run", fail)
+    row = defaults.compare(defaults.Case.of(2))
+    assert row["failure"] == row["tight failure"] == row["fine failure"] == "step 1: no"
+    assert row["ratio"] == row["gain"] == ""
+
+
+# -- benchmarks/iterations.py ------------------------------------------------------------------------------------------
+
+
+def test_iterations_are_those_of_the_residual_asked_for():
+    cloth = iterations.cloth_of("handkerchief", 5)
+    scene = wy.Scene(cloth, pins=cloth.corners("top"), sliding=False)
+    state = iterations.jittered(cloth, 0.15, False)
+    found = {name: iterations.count(scene, state, 1e-3, name, 1000) for name in iterations.PRECONDITIONERS}
+    for preconditioner, counts in found.items():
+        simulator = wy.Simulator(scene, step=1e-3, integrator="linear", preconditioner=preconditioner, tolerance=1e-6)
+        simulator.model.watches = False
+        simulator.state = state
+        simulator.run(1)
+        assert counts["to r"] == int(simulator.arrays["iterations"].numpy()[0])
+        # b has the momentum that the start has too
+        assert 0 < counts["to b"] <= counts["to r"] + 20
+    assert iterations.count(scene, state, 1e-3, "multilevel", 3) == {"to r": "> 3", "to b": "> 3"}
+
+
+def test_the_tables_of_iterations_from_the_command(tmp_path, monkeypatch):
+    monkeypatch.setattr(iterations, "STRETCHES", (1.0, 100.0))
+    monkeypatch.setattr(iterations, "JITTERS", (0.02,))
+    monkeypatch.setattr(iterations, "STAGES", (3e-4,))
+    path = tmp_path / "iterations.csv"
+    iterations.main(["--sizes", "5", "--size", "5", "--output", str(path)])
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["table"] for row in rows] == ["hung"] * 4 + ["stretch"] * 2 + ["jittered"] * 6
+    assert all(0 < int(row["multilevel, stage, to r"]) < 60 for row in rows)

@@ -128,6 +128,8 @@ class Parts:
         """Goes back to where the part started."""
         self.model.arrays.put("status", 0, 0, 0)
         self._copy("", "kept_")
+        # the bounds of energy may be those from before the run's first audit
+        self.model.arrays.put("audit_due", 1)
 
     def _accepts(self, size: float) -> bool:
         """Whether the part is good; says what size the next is to have."""

@@ -37,7 +37,7 @@ FRAME_BYTES = 13 * 8
 LARGEST = 2**31 - 1
 """Of what kernels count."""
 
-LEDGER = ("bounds", "begun", "steps_to_audit", "audit_due", "alert", "outer_force")
+LEDGER = ("bounds", "steps_to_audit", "audit_due", "alert", "outer_force")
 """Arrays of the watch over energy that one step leaves to the next."""
 
 
@@ -90,7 +90,8 @@ class Simulator:
         precision: "double" or "single".
         preconditioner: of the conjugate gradient: "multilevel" (``kernels/multilevel.py``), "incomplete"
             (``kernels/incomplete.py``) or "jacobi" (``kernels/solver.py``); None: "multilevel" where yarns are stiff
-            for their mass and the step, k_s h²/(m L) > 2e4, else "incomplete".
+            for their mass and the step, k_s h²/(m L) > 2e4, or > 3 where they slide and friction's damping is less than
+            10 h k_s/L, else "incomplete".
         tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to its start, which is the present velocities or 0,
             P the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit
             stages it is that of the adjoint's solves alone.

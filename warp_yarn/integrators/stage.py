@@ -106,13 +106,13 @@ class StageMethod:
         self._begin()
         for stage in range(self.stages):
             if stage:
-                model.add_pin_power(0)
                 model.take_inputs(stage)
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
                 if estimates:
                     model.copy(predicted="solution")
             self._newton(stage)
+            model.add_work(self._shares[stage])
         if estimates:
             model.launch("estimate_error", 1)
         if self._is_carried:
@@ -123,7 +123,12 @@ class StageMethod:
                 velocity="base_velocity",
                 euler_velocity="base_euler_velocity",
             )
-        model.end_step(1.0 - self.fraction if self.stages == 2 else 0.0)
+        model.end_step(by_stages=True)
+
+    @property
+    def _shares(self) -> tuple[float, ...]:
+        """Of each stage's slope in what a step makes."""
+        return (1.0,) if self.stages == 1 else (self.carried, self.fraction)
 
     def estimate_errors(self) -> None:
         """Makes steps leave an estimate of their error in ``step_error`` [m]: c h³ (a₂ − a₁)/(t₂ − t₁), of the
@@ -148,6 +153,7 @@ class StageMethod:
         """The stage starts from the present state, at the present velocity."""
         model = self.model
         model.open_step()
+        model.begin_work()
         model.take_inputs()
         model.arrays.zero("newton_iterations", "node_mass")
         model.launch("lump_mass", "segments")
