@@ -484,14 +484,17 @@ def test_half_the_step_keeps_paths_in_time():
     scene = wy.Scene(cloth, pins=pins, pin_path=path, forces={cloth.node(3, 1): force})
     half = ablation._halved(scene, None)
     whole, fine = wy.Simulator(scene, step=1e-5), wy.Simulator(half, step=5e-6)
-    # forces hold for two of the half steps what they hold for one of the whole; pins are where they are, in time
-    for _ in range(6):
+    # a force that holds a step of the whole holds two of the half; pins are half-way in the first of them
+    before = cloth.position[pins]
+    for k in range(6):
         whole.run(1)
-        targets = whole.arrays["pin_target"].numpy(), whole.arrays["applied_force"].numpy()
-        for _ in range(2):
+        target, force = whole.arrays["pin_target"].numpy().copy(), whole.arrays["applied_force"].numpy().copy()
+        for place in (0.5 * (before + target), target):
             fine.run(1)
-            np.testing.assert_array_equal(fine.arrays["applied_force"].numpy(), targets[1])
-        np.testing.assert_allclose(fine.arrays["pin_target"].numpy(), targets[0], rtol=1e-14)
+            np.testing.assert_allclose(fine.arrays["pin_target"].numpy(), place, rtol=0, atol=1e-17)
+            np.testing.assert_array_equal(fine.arrays["applied_force"].numpy(), force)
+        before = target
+        np.testing.assert_allclose(target, path[min(k, 3)], rtol=0, atol=1e-17)
 
 
 def test_a_still_cloth_has_nothing_to_be_relative_to():

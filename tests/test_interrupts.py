@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import types
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -267,34 +268,35 @@ def test_ctrl_c_at_any_time():
     sim = simulator(chunk=5)
     whole = sim.run(20)
     random, stopped = np.random.default_rng(0), 0
-    begin = time.perf_counter()
-    sim.reset()
-    sim.run(20)
-    length = time.perf_counter() - begin
+    length = np.inf
+    for _ in range(5):  # the shortest: the machine may be at other things
+        sim.reset()
+        begin = time.perf_counter()
+        sim.run(20)
+        length = min(length, time.perf_counter() - begin)
 
     raised = []
 
-    def stop(*_: object) -> None:
+    def stop(_: int, frame: types.FrameType | None) -> None:
         raised.append(1)
         if len(raised) < 2:
+            # the second comes while the first is dealt with
             signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-6, 2e-4))
-        raise _Stop
+        while frame is not None:
+            if frame.f_code is wy.Simulator.run.__code__:
+                raise _Stop
+            frame = frame.f_back  # nothing is interrupted but the run: neither this test nor what it calls then
 
     before = signal.signal(signal.SIGALRM, stop)
     try:
         for _ in range(40):
             sim.reset()
             raised.clear()
-            # the second comes while the first is dealt with
             with contextlib.suppress(_Stop):
-                try:
-                    signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-5, length))
-                    sim.run(20)
-                finally:
-                    while len(raised) < 2:
-                        with contextlib.suppress(_Stop):
-                            time.sleep(1e-5)
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
+                signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-5, length))
+                sim.run(20)
+            while len(raised) < 2:
+                time.sleep(1e-5)
             stopped += sim.steps_done < 20
             check_goes_on(sim, whole)
     finally:

@@ -12,6 +12,7 @@ from fractions import Fraction
 import h5py
 import numpy as np
 import pytest
+import torch
 from pxr import Usd, UsdGeom
 from scripts import exit_code, load, samples
 
@@ -636,7 +637,9 @@ def test_differences_are_taken_above_what_the_solver_leaves(monkeypatch):
     # three times what a plain difference makes of the parameter that does the least, another one in every run
     random, run = np.random.default_rng(0), Task._run
     noise = 3.0 * wl.DIFFERENCE * np.linalg.norm(exact, axis=0).min() / np.sqrt(len(exact))
-    monkeypatch.setattr(Task, "_run", lambda *a: run(*a) + noise * random.normal(size=target.position[1:].shape))
+    monkeypatch.setattr(
+        Task, "_run", lambda *a: run(*a) + noise * torch.as_tensor(random.normal(size=target.position[1:].shape))
+    )
     loose = Task(scene, target, parameters)
     residuals = loose.residuals(values)
     plain = [loose._difference(values, residuals, wl.DIFFERENCE, -row) for row in np.eye(4)]
