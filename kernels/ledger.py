@@ -32,7 +32,7 @@ SUDDEN = 0.1
 """Part of the energy that yarns give or take in a step that is looked at closely."""
 ALERT = 16
 """Steps after that, or after a gain, that are looked at closely too."""
-UNCERTAIN = 0.5
+UNCERTAIN = 0.25
 """The same of methods whose work is not known from their stages, eq. 2 and ROS2."""
 STILL = 1.0e-6
 """Speed of the whole cloth whose energy may always be gained [m/s]: rounding."""
@@ -160,7 +160,7 @@ def define(variant: Variant) -> SimpleNamespace:
             if gain[0] > scalar(GAIN):
                 room += gain[0] * before
             elif by_stages == 0:
-                room += scalar(UNCERTAIN) * before
+                room += scalar(UNCERTAIN) * wp.max(inner, before)
             bound = wp.min(bounds[0], bounds[1])
             if damps[0] != 0:
                 # there is no surer method: it only may not blow up

@@ -271,7 +271,7 @@ def test_equal_error_from_the_command(monkeypatch, tmp_path):
     monkeypatch.setattr(equal, "reference", lambda motion, size: None)
     # the last method never gets there
     last = list(equal.INTEGRATORS)[-1]
-    monkeypatch.setattr(equal, "steps_to", lambda motion, size, method, *_: [2, None] if method == last else [2, 4])
+    monkeypatch.setattr(equal, "steps_to", lambda motion, size, method, *_: [64, None] if method == last else [64, 128])
     output = tmp_path / "e.csv"
     chosen = ["--motions", "hung", "strip", "--sizes", "3", "4", "--fabric", "handkerchief"]
     equal.main([*chosen, "--repeats", "1", "--output", str(output)])
