@@ -25,6 +25,7 @@ from common import RESULTS, Timing, environment, one_core, print_table, turns, w
 from motions import Motion, add_options, find
 from work_precision import EQ_2, TARGETS, Reference, end, reference
 
+import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
 
 MOST_STEPS = 8192

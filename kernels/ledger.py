@@ -9,8 +9,8 @@ while after. W is the work of wind, applied forces and moving pins since. The sa
 A method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a step,
 the power at the step's ends says nothing of it.
 
-g is ``GAIN``: what gains more is made again, damped, in parts, or ends the run, for it would be wrong without saying so,
-or blow up. A run that must have a gradient is stopped only where energy doubles, as a step in parts has none.
+g is ``GAIN``: what gains more is made again, damped, in parts, or ends the run, for it would be wrong without saying
+so, or blow up. A run that must have a gradient is stopped only where energy doubles, as a step in parts has none.
 """
 
 import functools

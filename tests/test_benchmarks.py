@@ -273,14 +273,14 @@ def test_equal_error_from_the_command(monkeypatch, tmp_path):
     last = list(equal.INTEGRATORS)[-1]
     monkeypatch.setattr(equal, "steps_to", lambda motion, size, method, *_: [64, None] if method == last else [64, 128])
     output = tmp_path / "e.csv"
-    chosen = ["--motions", "hung", "strip", "--sizes", "3", "4", "--fabric", "handkerchief"]
+    chosen = ["--motions", "hung", "strip", "--sizes", "3", "4", "--fabric", "paper"]
     equal.main([*chosen, "--repeats", "1", "--output", str(output)])
     with open(output, newline="") as file:
         rows = list(csv.DictReader(file))
     kinds = [("hung", "3 × 3"), ("hung", "4 × 4"), ("strip", "5 × 3"), ("strip", "5 × 4")]
     assert list(dict.fromkeys((row["motion"], row["size"]) for row in rows)) == kinds
     assert len(rows) == len(kinds) * len(equal.TARGETS) * len(equal.INTEGRATORS)
-    assert {row["fabric"] for row in rows} == {"handkerchief"}
+    assert {row["fabric"] for row in rows} == {"paper"}
     assert {row["method"] for row in rows if row["of eq. 2's"] == ""} == {last}
 
 

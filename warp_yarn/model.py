@@ -414,8 +414,8 @@ class Model:
         self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0)
 
     def trust_energy(self) -> None:
-        """Lets all steps pass, until ``forget_energy``: steps that are made again, from the middle of a run, were watched
-        the first time."""
+        """Lets all steps pass, until ``forget_energy``: steps that are made again, from the middle of a run, were
+        watched the first time."""
         a = self.arrays
         a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0)
         a.put("audit_due", 0)
