@@ -96,7 +96,7 @@ def test_a_run_that_gains_ends_with_an_error_that_says_so(method):
     assert len(error.trajectory) == error.step
     # the simulator stays at the last frame
     np.testing.assert_array_equal(simulator.state.position, error.trajectory.position[-1])
-    # between audits gains of the terms that are not looked at go unseen; of midpoint some 11 %; ROS2's work is not known
+    # between audits gains of the terms that are not looked at go unseen; of midpoint some 11 %; ROS2's is unknown
     energy = energies(simulator, error.trajectory)
     assert energy.max() <= (2.0 if method == "ros2" else 1.15) * energy[0]
     # without the watch it goes on, to several times its energy
