@@ -41,7 +41,7 @@ from common import RESULTS, environment, measure, one_core, print_table, write_c
 from memory import forget_peak, peak, resident, settle
 
 import warp_yarn as wy
-from warp_yarn import paper
+from warp_yarn.presets import paper
 
 TARGET = np.array([1.0, 0.3, 0.5])
 """Of the centre, relative to where it starts [m]."""
@@ -85,7 +85,6 @@ class Ours:
     def __init__(self, size: int, duration: float, step: float, every: int):
         # Newton's processes have no use for torch.
         import torch
-
         import warp_yarn.torch as wt
 
         torch.set_num_threads(1)

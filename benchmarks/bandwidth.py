@@ -39,7 +39,7 @@ from matplotlib.figure import Figure
 from plots import COLORS, PICTURES, save
 
 import warp_yarn as wy
-from warp_yarn import paper
+from warp_yarn.presets import paper
 
 ELEMENTS = 1 << 25
 """Of each array of the triad."""

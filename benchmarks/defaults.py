@@ -36,8 +36,8 @@ import warp as wp
 from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn.fabrics import FABRICS
-from warp_yarn.state import CLOTH_NUMBERS
+from warp_yarn.presets.fabrics import FABRICS
+from warp_yarn.simulation.state import CLOTH_NUMBERS
 
 TIGHT = {"newton_tolerance": 1e-10, "tolerance": 1e-12}
 KINDS = ("free", "thrown", "hung", "carried", "clamped")

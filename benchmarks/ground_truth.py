@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.learn import PAPER as PARAMETERS
-from warp_yarn.learn import value_of, with_values
-from warp_yarn.state import FIELDS
+from warp_yarn.calibration.learn import PAPER as PARAMETERS
+from warp_yarn.calibration.learn import value_of, with_values
+from warp_yarn.presets import paper
+from warp_yarn.simulation.state import FIELDS
 
 KINDS = ("same", "finer")
 
@@ -60,7 +60,7 @@ class Fabric:
         return paper.hung_cloth(self.weave, size, size, self.yarns)
 
     def value(self, parameter: str) -> float:
-        """The true value of a parameter, named as in ``warp_yarn.learn.Parameter``."""
+        """The true value of a parameter, named as in ``warp_yarn.calibration.learn.Parameter``."""
         return value_of(self.model(3), parameter)
 
     def truth(self, size: int, frames: int, kind: str, **options: Any) -> wy.Trajectory:

@@ -19,8 +19,8 @@ import warp as wp
 from common import RESULTS, environment, one_core, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.fabrics import FABRICS
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
 
 SAMPLES = 100
 """Of energy and memory, equally spaced."""

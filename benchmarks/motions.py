@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.fabrics import FABRICS
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Motion:
         spin: of the cloth about its centre at the beginning, 3 numbers [rad/s].
         along: whether the motion is seen by one who moves with ``speed``: pins go on with it, and displacements are
             those from where it would have brought the cloth.
-        fabric: a name of ``warp_yarn.fabrics``.
+        fabric: a name of ``warp_yarn.presets.fabrics``.
         pose: of the Cloth.
         rows: of the cloth; None: as many as columns.
     """

@@ -34,7 +34,7 @@ from common import RESULTS, environment, one_core, print_table, write_csv
 from ground_truth import Fabric
 
 import warp_yarn as wy
-from warp_yarn.learn import PAPER, Task, learn, value_of
+from warp_yarn.calibration.learn import PAPER, Task, learn, value_of
 
 FABRIC = Fabric("plain", (1, 2))
 WITHIN = 0.01

@@ -48,8 +48,8 @@ from ground_truth import KINDS, TIGHT, Fabric
 from plots import PICTURES
 
 import warp_yarn as wy
-from warp_yarn import paper
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.presets import paper
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], Iterator[list[dict[str, Any]]]]] = {
     "table2": paper_parameters.table2,

@@ -16,8 +16,8 @@ from matplotlib.ticker import LogLocator
 from plots import COLORS, save
 
 import warp_yarn as wy
+from warp_yarn.calibration.learn import Result, Task, learn, value_of
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.learn import Result, Task, learn, value_of
 
 OF_YARNS = 6
 """So many of NAMES are of the yarns."""

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from plots import COLORS, MARKERS, save
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.learn import Task, learn, with_values
+from warp_yarn.calibration.learn import Task, learn, with_values
+from warp_yarn.presets import paper
 
 METHODS = ("ours", "BO", "sheet")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from warp_yarn.files import whole_file
+from warp_yarn.io.files import whole_file
 
 PICTURES = Path(__file__).parents[1] / "docs"
 

@@ -20,10 +20,11 @@ import numpy as np
 import scipy.optimize
 import tqdm
 import warp as wp
-from warp_yarn.kernels import Variant, wind
+from warp_yarn.kernels import Variant
+from warp_yarn.kernels.terms import wind
 
 import warp_yarn as wy
-from warp_yarn import paper
+from warp_yarn.presets import paper
 
 SUBSTEPS = 40
 """A frame: at the top of the ranges, a particle of the border swings with some 4e4 / s, and 2 / 2.5e-5 s is 8e4 / s."""
@@ -134,7 +135,7 @@ def bounds(cloth: wy.Cloth, values: dict[str, float]) -> tuple[np.ndarray, np.nd
 
     Args:
         cloth: its spacing and radius are used.
-        values: of yarns to start from, named as in ``warp_yarn.learn.Parameter``.
+        values: of yarns to start from, named as in ``warp_yarn.calibration.learn.Parameter``.
     """
     area, spacing = np.pi * cloth.radius**2, cloth.spacing
     density, stretch, bend = (

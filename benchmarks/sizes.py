@@ -32,9 +32,9 @@ from memory import peak
 from plots import COLORS, MARKERS, PICTURES, save
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.fabrics import FABRICS
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
 
 SIZES = (5, 10, 25, 50, 100, 200, 400, 600)
 LARGEST = 1000

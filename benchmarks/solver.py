@@ -30,8 +30,8 @@ import warp as wp
 from common import RESULTS, environment, measure, one_core, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.fabrics import FABRICS
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
 
 WARM_UP = 50
 """Steps before the one that is measured: the cloth moves and bends by then."""

@@ -36,10 +36,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.fabrics import FABRICS
-from warp_yarn.files import whole_file
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.io.files import whole_file
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
 
 DURATION = 1.0 / 15.0
 COUNTS = (666, 200, 66, 20, 6, 2)

@@ -25,7 +25,7 @@ from matplotlib.lines import Line2D
 from motions import Motion, add_options, find
 from plots import COLORS, MARKERS, PICTURES, save
 
-from warp_yarn.ablation import Ablation, ablate
+from warp_yarn.simulation.ablation import Ablation, ablate
 
 LEAST = 1e-8
 """Changes below this are drawn here: rounding, and the solver's tolerance."""

@@ -27,8 +27,8 @@ import warp as wp
 from common import RESULTS, environment, one_core, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.learn import Parameter, Task, learn, value_of
+from warp_yarn.calibration.learn import Parameter, Task, learn, value_of
+from warp_yarn.presets import paper
 
 FABRICS = ("paper", "handkerchief")
 POSES = ("flat", "saddle")

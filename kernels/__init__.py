@@ -1,38 +1,30 @@
-"""What runs on the device, pure Warp: one file a physical effect, one for the solver, one for the step around it.
+"""What runs on the device, pure Warp, in five rooms that say themselves what belongs there and what they import.
 
-Installed as ``warp_yarn.kernels``. A new effect is a new file with its ``TERM``, and one line here; ``CONTRIBUTING.md``
-has the rest.
+Installed as ``warp_yarn.kernels``. A new effect is a new file in ``terms`` with its ``TERM``, and one line here;
+``CONTRIBUTING.md`` has the rest.
 """
 
 import functools
 
 import warp as wp
 
-from . import (
-    adjoint,
-    applied,
+from .core.variant import Term, Variant
+from .linear import block_matrix, conjugate_gradient, incomplete_cholesky, multilevel
+from .nonlinear import newton
+from .stepping import energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
+from .terms import (
+    applied_force,
     bending,
-    conjugate_gradient,
-    contact,
+    crossing_normal,
     friction,
     gravity,
-    history,
-    incomplete,
     inertia,
-    ledger,
-    multilevel,
-    parallel,
+    jamming,
     pins,
-    ros2,
     shear,
-    solver,
-    stage,
-    stage_adjoint,
-    step,
     stretch,
     wind,
 )
-from .variant import Term, Variant
 
 __all__ = ["TERMS", "Term", "Variant", "build"]
 
@@ -43,11 +35,11 @@ _REGISTERED = (
     stretch.TERM,
     bending.TERM,
     gravity.TERM,
-    parallel.TERM,
+    jamming.TERM,
     shear.TERM,
     wind.TERM,
     pins.TERM,
-    applied.TERM,
+    applied_force.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
 TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
@@ -63,23 +55,23 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
     # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does by itself, one
     # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
-    kernels = {"contact_normal": contact.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
+    kernels = {"contact_normal": crossing_normal.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
     for term in TERMS.values():
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
-    for part in (step, ros2):
+    for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
     for part in (
-        step,
-        solver,
-        incomplete,
+        linear,
+        block_matrix,
+        incomplete_cholesky,
         conjugate_gradient,
         multilevel,
-        ledger,
-        history,
-        adjoint,
-        stage,
+        newton,
+        energy_watch,
+        frames,
+        linear_adjoint,
         stage_adjoint,
         ros2,
     ):

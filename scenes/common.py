@@ -15,7 +15,7 @@ import warp as wp
 
 import warp_yarn as wy
 from warp_yarn.errors import number, whole
-from warp_yarn.files import check_writable
+from warp_yarn.io.files import check_writable
 
 
 @dataclasses.dataclass(frozen=True)

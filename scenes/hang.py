@@ -18,9 +18,9 @@ import numpy as np
 from common import Run, add_slowdown, command, file_ending, make_folders, simulate, write_all
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.fabrics import FABRICS
-from warp_yarn.usd import ENDINGS
+from warp_yarn.io.usd import ENDINGS
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
 
 OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "yarns", "wind", "step", "locked")
 """Options that a recording settles, where one is resumed."""

@@ -32,13 +32,13 @@ from matplotlib.figure import Figure
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 import warp_yarn as wy
-from warp_yarn import paper
+from warp_yarn.calibration.learn import PAPER, Parameter, Result, Task, learn, learnable, split, value_of
 from warp_yarn.errors import whole
-from warp_yarn.files import whole_file
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.learn import PAPER, Parameter, Result, Task, learn, learnable, split, value_of
-from warp_yarn.state import FIELDS
-from warp_yarn.usd import ENDINGS, reload, writing
+from warp_yarn.io.files import whole_file
+from warp_yarn.io.usd import ENDINGS, reload, writing
+from warp_yarn.presets import paper
+from warp_yarn.simulation.state import FIELDS
 
 HDF5 = (".h5", ".hdf5")
 

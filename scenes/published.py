@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from common import add_slowdown, command, file_ending, make_folders, simulate, write_all
 
 import warp_yarn as wy
-from warp_yarn.usd import ENDINGS
+from warp_yarn.io.usd import ENDINGS
 
 FRAMES = (2, 5, 10, 25, 50, 100, 200, 300, 400)
 """Frames to compare, and the last one."""

@@ -24,9 +24,9 @@ from common import command, file_ending, make_folders
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
-from warp_yarn import paper
 from warp_yarn.errors import number, whole
-from warp_yarn.files import whole_file
+from warp_yarn.io.files import whole_file
+from warp_yarn.presets import paper
 
 DAMPING = 1e-4
 """d_f [N s/m]: 1e-6 N at 1 cm/s, under a hundredth of what a crossing sticks with. The paper's 1000 would hide it."""

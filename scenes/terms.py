@@ -25,11 +25,11 @@ from pathlib import Path
 from common import command
 
 import warp_yarn as wy
-from warp_yarn import paper
-from warp_yarn.ablation import Ablation, ablate
 from warp_yarn.errors import whole
-from warp_yarn.fabrics import FABRICS
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.presets import paper
+from warp_yarn.presets.fabrics import FABRICS
+from warp_yarn.simulation.ablation import Ablation, ablate
 
 
 def parser() -> argparse.ArgumentParser:

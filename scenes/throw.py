@@ -22,15 +22,15 @@ from typing import Any
 import numpy as np
 import torch
 import tqdm
+import warp_yarn.torch as wt
 from common import add_slowdown, command, file_ending, make_folders, write_all
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
 from warp_yarn.errors import finite_array, number, whole
-from warp_yarn.fabrics import FABRICS
-from warp_yarn.files import whole_file
-from warp_yarn.usd import ENDINGS
+from warp_yarn.io.files import whole_file
+from warp_yarn.io.usd import ENDINGS
+from warp_yarn.presets.fabrics import FABRICS
 
 GRAVITY = np.array([0.0, 0.0, -9.8])
 

@@ -1,6 +1,6 @@
 """The physics a second time, in torch float64, from the formulas alone: what the kernels are held to.
 
-Written from ``physics.md`` row by row and column by column, not from the kernels nor from ``warp_yarn.topology``.
+Written from ``physics.md`` row by row and column by column, not from the kernels nor from the topology.
 Energies are functions of one element; forces, Jacobians and Hessians come of them by automatic differentiation.
 
 Unknowns stand in one vector, as in ``Simulator.system``: q = (x of every node, then u, v of every node), and v = q̇.

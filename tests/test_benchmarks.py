@@ -11,8 +11,8 @@ import warp as wp
 from scripts import exit_code, load
 
 import warp_yarn as wy
-from warp_yarn import ablation
-from warp_yarn.ablation import ablate
+from warp_yarn.simulation import ablation
+from warp_yarn.simulation.ablation import ablate
 
 solver = load("benchmarks/solver.py")
 work = load("benchmarks/work_precision.py")
@@ -433,7 +433,7 @@ def test_the_triad_moves_what_it_says():
         np.testing.assert_array_equal(part[2].numpy(), np.full((100, 3), 7.0))
 
 
-# -- warp_yarn/ablation.py, scenes/terms.py, benchmarks/terms.py ------------------------------------------------------
+# -- warp_yarn/simulation/ablation.py, scenes/terms.py, benchmarks/terms.py ----
 
 
 def moved_by_hand(scene, changed, steps, step):

@@ -11,7 +11,7 @@ import pytest
 from warp_yarn.kernels import TERMS
 
 import warp_yarn as wy
-from warp_yarn.topology import Topology
+from warp_yarn.description.topology import Topology
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))

@@ -5,12 +5,12 @@ import functools
 import numpy as np
 import pytest
 import torch
-from warp_yarn.kernels.ledger import EVERY
+import warp_yarn.torch as wt
+from warp_yarn.kernels.stepping.energy_watch import EVERY
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
-from warp_yarn.fabrics import FABRICS
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.presets.fabrics import FABRICS
 
 METHODS = tuple(INTEGRATORS)
 
@@ -136,7 +136,7 @@ def test_a_step_that_gains_is_made_by_the_fallback():
 
 def force_a_gain(simulator: wy.Simulator) -> list[int]:
     """Says once of a whole step, in Python, that it gained energy."""
-    from warp_yarn.kernels.step import GAINED
+    from warp_yarn.kernels.core.status import GAINED
 
     advance, said = simulator._advance, []
 

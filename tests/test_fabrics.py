@@ -1,10 +1,10 @@
-"""warp_yarn/fabrics.py: that the named fabrics weigh, bend and shear as the sources say that they stand for."""
+"""warp_yarn/presets/fabrics.py: that the named fabrics weigh, bend and shear as the sources say that they stand for."""
 
 import numpy as np
 import pytest
 
 import warp_yarn as wy
-from warp_yarn.fabrics import FABRICS
+from warp_yarn.presets.fabrics import FABRICS
 
 GF = 9.80665e-3
 """N: the force of the textile laboratories' units."""

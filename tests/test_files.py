@@ -11,7 +11,7 @@ import pytest
 from waving import waving
 
 import warp_yarn as wy
-from warp_yarn import files
+from warp_yarn.io import files
 
 
 @pytest.mark.parametrize("write", [wy.write_usd, lambda path, trajectory: trajectory.save(path)], ids=["usd", "npz"])

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import warp_yarn as wy
-from warp_yarn.fabrics import FABRICS
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.presets.fabrics import FABRICS
 
 METHODS = tuple(INTEGRATORS)
 G = 9.8

@@ -12,10 +12,10 @@ import pytest
 import torch
 import torch.utils.checkpoint
 import warp as wp
+import warp_yarn.torch as wt
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
-from warp_yarn import arrays
+from warp_yarn.device import arrays
 
 YARNS = [wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4), wy.Yarn(density=2.5e-3, stretch=1.7e5, bend=1.1e-4)]
 WIND = wy.Wind(velocity=(0.3, 5.0, -0.2))

@@ -205,7 +205,7 @@ def test_the_largest_numbers_are_taken() -> None:
 
 def test_without_torch_there_is_no_attribute(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "warp_yarn.torch", raising=False)
+    monkeypatch.delitem(sys.modules, "warp_yarn.gradients.rollout", raising=False)
     monkeypatch.delattr(wy, "torch", raising=False)
     assert not hasattr(wy, "torch") and getattr(wy, "torch", 3) == 3
     with pytest.raises(wy.InputError, match=r"pip install warp_yarn\[torch\]"):

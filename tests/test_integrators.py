@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
+import warp_yarn.torch as wt
 from test_gradients import GROUPS, WIND, cloth, jittered, scaled, scene_for
-from warp_yarn.kernels.step import STALLED
+from warp_yarn.kernels.core.status import STALLED
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
 
 BEYOND_EQ_2 = [name for name in INTEGRATORS if name != "linear"]

@@ -19,9 +19,9 @@ from test_hard_states import STATES
 from test_integrators import fails_at_first
 
 import warp_yarn as wy
-from warp_yarn import exclusive
+from warp_yarn.device import exclusive
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.state import FIELDS
+from warp_yarn.simulation.state import FIELDS
 
 # of an exception raised in a __del__, which Python reports and drops
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -17,10 +17,10 @@ from pxr import Usd, UsdGeom
 from scripts import exit_code, load, samples
 
 import warp_yarn as wy
-from warp_yarn import learn as wl
-from warp_yarn.learn import PAPER, Parameter, Task, learn, value_of, with_values
-from warp_yarn.published import DATASETS, PROPERTIES
-from warp_yarn.state import FIELDS
+from warp_yarn.calibration import learn as wl
+from warp_yarn.calibration.learn import PAPER, Parameter, Task, learn, value_of, with_values
+from warp_yarn.io.published import DATASETS, PROPERTIES
+from warp_yarn.simulation.state import FIELDS
 
 scene_script = load("scenes/learn.py")
 optimizers = load("benchmarks/optimizers.py")

@@ -12,8 +12,8 @@ import scipy.integrate
 from scripts import load
 
 import warp_yarn as wy
+from warp_yarn.calibration.learn import with_values
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.learn import with_values
 
 paper = load("benchmarks/paper.py")
 bayesian, sheet, ground_truth = paper.bayesian, paper.sheet, sys.modules["ground_truth"]
@@ -48,7 +48,7 @@ def test_friction_of_the_ground_truth_is_coulombs(weave):
     simulator = wy.Simulator(hard)
     state = wy.State(position, euler, np.zeros_like(position), rates)
     limit = cloth.friction * simulator.contact(state)[1][:, None]
-    # As far as the spring is straight: in the last tenth before its limit it bends over to it (kernels/friction.py).
+    # As far as the spring is straight: in the last tenth before its limit it bends over (kernels/terms/friction.py).
     delta = rng.uniform(-0.89, 0.89, size=euler.shape) * limit / cloth.friction_stiffness
     forces = simulator.forces(dataclasses.replace(state, anchor=euler - delta))
     found = forces.pop("friction")[1][crossing]

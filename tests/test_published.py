@@ -11,7 +11,7 @@ import pytest
 from scripts import load
 
 import warp_yarn as wy
-from warp_yarn.published import PROPERTIES
+from warp_yarn.io.published import PROPERTIES
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "wind_plain_12_5x5.h5"
 

@@ -13,7 +13,7 @@ import vtkmodules.vtkRenderingCore
 from waving import BLUE, RED, waving
 
 import warp_yarn as wy
-from warp_yarn import geometry, render
+from warp_yarn.view import geometry, render
 
 pytestmark = pytest.mark.slow  # VTK takes seconds to load and to draw
 

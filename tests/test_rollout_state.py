@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+import warp_yarn.torch as wt
 from test_gradients import WIND, cloth, gradcheck, jittered, scene_for
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.state import FIELDS
+from warp_yarn.simulation.state import FIELDS
 
 STEPS = 3
 

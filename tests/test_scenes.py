@@ -13,7 +13,7 @@ from pxr import Usd, UsdGeom
 from scripts import ROOT, exit_code, load, samples
 
 import warp_yarn as wy
-from warp_yarn.state import FIELDS
+from warp_yarn.simulation.state import FIELDS
 
 hang = load("scenes/hang.py")
 
@@ -171,7 +171,7 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
 
 
 def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, capsys):
-    monkeypatch.setattr("warp_yarn.simulator.CHUNK_BYTES", 0)  # a step at a time
+    monkeypatch.setattr("warp_yarn.simulation.simulator.CHUNK_BYTES", 0)  # a step at a time
     run = wy.Simulator.run_chunk
 
     def storm(simulator, steps):
@@ -196,7 +196,7 @@ def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, caps
 
 
 def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
-    monkeypatch.setattr("warp_yarn.simulator.CHUNK_BYTES", 0)  # a step at a time
+    monkeypatch.setattr("warp_yarn.simulation.simulator.CHUNK_BYTES", 0)  # a step at a time
     run, calls = wy.Simulator.run_chunk, []
 
     def interrupted(simulator, steps):

@@ -11,8 +11,8 @@ import pytest
 import warp as wp
 
 import warp_yarn as wy
-from warp_yarn.geometry import contact_normals
-from warp_yarn.state import FIELDS
+from warp_yarn.simulation.state import FIELDS
+from warp_yarn.view.geometry import contact_normals
 
 STEPS = 3
 SPEEDS = (1.0, 2.0, 3.0, 4.0)

@@ -9,7 +9,7 @@ from cases import YARNS
 from reference import Oracle, draft
 
 import warp_yarn as wy
-from warp_yarn.topology import Topology
+from warp_yarn.description.topology import Topology
 
 SIZES = ((3, 3), (5, 5), (4, 7), (9, 6))
 CLOTHS = tuple(itertools.product(wy.WEAVES, SIZES))

@@ -8,7 +8,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdValidation
 from waving import BLUE, RED, rotation, waving
 
 import warp_yarn as wy
-from warp_yarn import geometry, usd
+from warp_yarn.io import usd
+from warp_yarn.view import geometry
 
 SINGLE = 8e-9
 """Rounding to single precision of the coordinates here, which are under 1/16 m, and of a sum of some of them [m]."""

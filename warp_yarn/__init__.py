@@ -4,16 +4,19 @@ import importlib
 import importlib.metadata
 from types import ModuleType
 
-from . import fabrics, paper
-from .cloth import Cloth, Yarn
+from . import moved
+from .description.cloth import Cloth, Yarn
+from .description.scene import Scene, Wind
+from .description.weave import WEAVES, Weave
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
-from .published import Published, read_published
-from .render import write_mp4, write_png
-from .scene import Scene, Wind
-from .simulator import Simulator
-from .state import State, Trajectory
-from .usd import write_usd
-from .weave import WEAVES, Weave
+from .io.published import Published, read_published
+from .io.usd import write_usd
+from .presets import fabrics, paper
+from .simulation.simulator import Simulator
+from .simulation.state import State, Trajectory
+from .view.render import write_mp4, write_png
+
+moved.install()
 
 __version__ = importlib.metadata.version("warp_yarn")
 

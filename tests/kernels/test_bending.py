@@ -10,7 +10,7 @@ from cases import Case, cases
 from checks import InternalChecks, check_definite, error, matrix
 from reference import Tensor, angle, clamped, presence, tensor, unit
 from torch.func import grad, hessian, vmap
-from warp_yarn.kernels.bending import SERIES_BELOW
+from warp_yarn.kernels.terms.bending import SERIES_BELOW
 
 import warp_yarn as wy
 

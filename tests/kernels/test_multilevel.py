@@ -8,8 +8,8 @@ import pytest
 from cases import make_state
 
 import warp_yarn as wy
-from warp_yarn.fabrics import FABRICS
-from warp_yarn.model import SOLVED
+from warp_yarn.device.model import SOLVED
+from warp_yarn.presets.fabrics import FABRICS
 
 FEWEST, COARSEST = 3, 9
 """Yarns that are not coarsened further, and nodes of a level that is solved exactly."""

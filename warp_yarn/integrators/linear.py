@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import warp as wp
 
-from ..model import BETWEEN, MATRIX, Graphs, Model
+from ..device.model import BETWEEN, MATRIX, Graphs, Model
 
 
 class LinearlyImplicitEuler:

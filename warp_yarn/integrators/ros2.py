@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import warp as wp
 
-from ..kernels.ros2 import GAMMA
-from ..model import BETWEEN, MATRIX, Model
+from ..device.model import BETWEEN, MATRIX, Model
+from ..kernels.stepping.ros2 import GAMMA
 from .linear import LinearlyImplicitEuler
 
 EXPLICIT = ("wind",)

@@ -1,4 +1,4 @@
-"""What implicit methods share: a stage, solved by Newton's iteration, and its adjoint (``kernels/stage.py``)."""
+"""What implicit methods share: a stage, solved by Newton's iteration (``kernels/nonlinear``), and its adjoint."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ..kernels.step import STALLED
-from ..model import BETWEEN, Graphs, Model
+from ..device.model import BETWEEN, Graphs, Model
+from ..kernels.core.status import STALLED
 
 STATE = ("position", "euler", "velocity", "euler_velocity")
 MOVED = (*STATE, "increment", "euler_increment")

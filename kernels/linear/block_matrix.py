@@ -1,0 +1,358 @@
+"""The implicit system: its matrix on the weave's stencil, and the preconditioned conjugate gradients that solve it.
+
+The matrix is symmetric, so each node keeps its own blocks and those of its upper neighbours only, in fixed slots:
+0 and 1 the next crossing of its warp and weft yarn, 2 and 3 the second next, 4 and 5 the diagonal ones. The first
+four slots carry sliding blocks of the yarn's own coordinate too (slot mod 2 is its direction); a diagonal neighbour
+couples positions alone. A slot that a scene's terms do not fill is not stored (``stencil`` is 2, 4 or 6 wide).
+
+    diagonal_xx [node]        3 × 3    upper_xx [stencil·node + slot]  3 × 3   row x of node, column x of neighbour
+    diagonal_xs [2·node + d]  3        upper_xs [4·node + slot]        3       row x of node, column s of neighbour
+    diagonal_ss [2·node + d]  1        upper_sx [4·node + slot]        3       row s of node, column x of neighbour
+                                       upper_ss [4·node + slot]        1
+
+Two preconditioners P. Here the diagonal of A (``jacobi``): every node on its own, so it is what a parallel machine
+wants. In ``incomplete.py`` one that takes a twelfth of the iterations, node after node, and in
+``conjugate_gradient.py`` the iteration with it.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..core import memory
+from ..core.status import NOT_CONVERGED, NOT_FINITE
+from ..core.variant import Variant
+
+_GATHER = """
+    row a = {}, b = {}, c = {}, x_s = {}, u_x = {}, v_x = {};
+    SCALAR u_s = 0, v_s = 0;
+    auto add = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
+        const int j = neighbour.data[stencil * i + slot];
+        if (j < 0)
+            return;
+        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+        const SCALAR* of = x.data[j].c;
+        const row its = {of[0], of[1], of[2], 0};
+        a = a + *(const row*)m * its;
+        b = b + *(const row*)(m + 3) * its;
+        c = c + *(const row*)(m + 6) * its;
+#if SLIDING
+        if (slot < 4) {
+            const int k = 4 * i + slot;
+            const SCALAR along = s.data[2 * j + direction];
+            x_s = x_s + *(const row*)upper_xs.data[k].c * along;
+            s_x = s_x + *(const row*)upper_sx.data[k].c * its;
+            s_s += upper_ss.data[k] * along;
+        }
+#endif
+    };
+    for (int slot = stencil - 1; slot >= 0; --slot) {
+        add(slot, 1, v_x, v_s);
+#if SLIDING
+        add(--slot, 0, u_x, u_s);
+#endif
+    }
+    wp::vec_t<5, SCALAR> y;
+    y.c[0] = a[0] + a[1] + a[2];
+    y.c[1] = b[0] + b[1] + b[2];
+    y.c[2] = c[0] + c[1] + c[2];
+#if SLIDING
+    for (int k = 0; k < 3; ++k)
+        y.c[k] += x_s[k];
+    y.c[3] = u_x[0] + u_x[1] + u_x[2] + u_s;
+    y.c[4] = v_x[0] + v_x[1] + v_x[2] + v_s;
+#endif
+    return y;
+"""
+_SPREAD = """
+    auto take = [&](int slot, int direction, SCALAR along) {
+        const int j = neighbour.data[stencil * i + slot];
+        if (j < 0)
+            return;
+        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+        SCALAR* of = y_x.data[j].c;
+        row its = {of[0], of[1], of[2], 0};
+        its = its - *(const row*)m * x.c[0];
+        its = its - *(const row*)(m + 3) * x.c[1];
+        its = its - *(const row*)(m + 6) * x.c[2];
+#if SLIDING
+        if (slot < 4) {
+            const int k = 4 * i + slot;
+            its = its - *(const row*)upper_sx.data[k].c * along;
+            y_s.data[2 * j + direction] -= wp::dot(upper_xs.data[k], x) + upper_ss.data[k] * along;
+        }
+#endif
+        of[0] = its[0];
+        of[1] = its[1];
+        of[2] = its[2];
+    };
+    for (int slot = 0; slot < stencil; ++slot) {
+        take(slot, 0, u);
+#if SLIDING
+        take(++slot, 1, v);
+#endif
+    }
+"""
+
+
+@functools.cache
+def functions(variant: Variant) -> SimpleNamespace:
+    """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
+    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    vec5 = wp.types.vector(5, scalar)
+    at, put = memory.functions(variant).at, memory.functions(variant).put
+
+    @wp.func
+    def times(m: mat33, x: vec3) -> vec3:
+        """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
+        return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
+
+    @wp.func_native(memory.rows(variant, _GATHER))
+    def gather_together(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+        s: wp.array(dtype=scalar),
+    ) -> vec5: ...
+
+    @wp.func
+    def gather(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+        s: wp.array(dtype=scalar),
+    ):
+        """Row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
+        y = gather_together(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, x, s)
+        return vec3(y[0], y[1], y[2]), y[3], y[4]
+
+    @wp.func_native(memory.rows(variant, _SPREAD))
+    def spread(
+        i: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        x: vec3,
+        u: scalar,
+        v: scalar,
+        y_x: wp.array(dtype=vec3),
+        y_s: wp.array(dtype=scalar),
+    ):
+        """y −= Uᵀ (x, u, v), what row i of U gives to others."""
+        ...
+
+    @wp.func
+    def multiply(
+        nodes: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        diagonal_xx: wp.array(dtype=mat33),
+        diagonal_xs: wp.array(dtype=vec3),
+        diagonal_ss: wp.array(dtype=scalar),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        p_x: wp.array(dtype=vec3),
+        p_s: wp.array(dtype=scalar),
+        q_x: wp.array(dtype=vec3),
+        q_s: wp.array(dtype=scalar),
+    ):
+        """q += A p. One pass: a row adds its upper half to itself, and the transposed blocks to its neighbours."""
+        u = scalar(0.0)
+        v = scalar(0.0)
+        for i in range(nodes):
+            x = at(p_x, i)
+            y, y_u, y_v = gather(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s)
+            y += times(at(diagonal_xx, i), x)
+            if wp.static(sliding):
+                u = at(p_s, 2 * i)
+                v = at(p_s, 2 * i + 1)
+                xs_u = at(diagonal_xs, 2 * i)
+                xs_v = at(diagonal_xs, 2 * i + 1)
+                y += xs_u * u + xs_v * v
+                put(q_s, 2 * i, at(q_s, 2 * i) + y_u + wp.dot(xs_u, x) + at(diagonal_ss, 2 * i) * u)
+                put(q_s, 2 * i + 1, at(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + at(diagonal_ss, 2 * i + 1) * v)
+            put(q_x, i, at(q_x, i) + y)
+            spread(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, -x, -u, -v, q_x, q_s)
+
+    @wp.func
+    def report(
+        count: int,
+        rz: scalar,
+        size: scalar,
+        limit: scalar,
+        iterations: wp.array(dtype=int),
+        residual: wp.array(dtype=scalar),
+        status: wp.array(dtype=int),
+    ) -> bool:
+        """Writes how the iteration ended; whether it failed, and no step before it had."""
+        iterations[0] = count
+        residual[0] = wp.sqrt(wp.max(rz, scalar(0.0)) / wp.max(size, scalar(1.0e-30)))
+        if rz <= limit or status[0] != 0:
+            return False
+        status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
+        return True
+
+    return SimpleNamespace(times=times, gather=gather, spread=spread, multiply=multiply, report=report)
+
+
+@functools.cache
+def define(variant: Variant) -> SimpleNamespace:
+    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    multiply, report = functions(variant).multiply, functions(variant).report
+    module = variant.module("solver")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def apply_matrix(
+        nodes: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        diagonal_xx: wp.array(dtype=mat33),
+        diagonal_xs: wp.array(dtype=vec3),
+        diagonal_ss: wp.array(dtype=scalar),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        p_x: wp.array(dtype=vec3),
+        p_s: wp.array(dtype=scalar),
+        q_x: wp.array(dtype=vec3),
+        q_s: wp.array(dtype=scalar),
+    ):
+        """q += A p."""
+        multiply(
+            nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
+            upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
+        )  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False)
+    def jacobi_conjugate_gradient(
+        # matrix
+        nodes: int,
+        stencil: int,
+        neighbour: wp.array(dtype=int),
+        diagonal_xx: wp.array(dtype=mat33),
+        diagonal_xs: wp.array(dtype=vec3),
+        diagonal_ss: wp.array(dtype=scalar),
+        upper_xx: wp.array(dtype=mat33),
+        upper_xs: wp.array(dtype=vec3),
+        upper_sx: wp.array(dtype=vec3),
+        upper_ss: wp.array(dtype=scalar),
+        inverse_x: wp.array(dtype=vec3),
+        inverse_s: wp.array(dtype=scalar),
+        # right-hand side, and when to stop
+        rhs: wp.array(dtype=vec3),
+        euler_rhs: wp.array(dtype=scalar),
+        tolerance: wp.array(dtype=scalar),
+        most_iterations: int,
+        # start in, solution out
+        solution: wp.array(dtype=vec3),
+        euler_solution: wp.array(dtype=scalar),
+        # work space
+        r_x: wp.array(dtype=vec3),
+        r_s: wp.array(dtype=scalar),
+        p_x: wp.array(dtype=vec3),
+        p_s: wp.array(dtype=scalar),
+        q_x: wp.array(dtype=vec3),
+        q_s: wp.array(dtype=scalar),
+        # report out
+        iterations: wp.array(dtype=int),
+        residual: wp.array(dtype=scalar),
+        status: wp.array(dtype=int),
+    ):
+        """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch of one thread.
+
+        What is held still has an inverse diagonal of 0, so it keeps its value, enters the right-hand side through
+        the first residual, and its row of the residual is what holding it takes.
+        """
+        zero = scalar(0.0)
+        for i in range(nodes):
+            q_x[i] = vec3()
+            if wp.static(sliding):
+                q_s[2 * i] = zero
+                q_s[2 * i + 1] = zero
+        multiply(
+            nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
+            upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution, q_x, q_s,
+        )  # fmt: skip
+        rz = zero
+        for i in range(nodes):
+            r = rhs[i] - q_x[i]
+            z = wp.cw_mul(inverse_x[i], r)
+            rz += wp.dot(r, z)
+            r_x[i] = r
+            p_x[i] = z
+            q_x[i] = vec3()
+            if wp.static(sliding):
+                for s in range(2 * i, 2 * i + 2):
+                    r_1 = euler_rhs[s] - q_s[s]
+                    z_1 = inverse_s[s] * r_1
+                    rz += r_1 * z_1
+                    r_s[s] = r_1
+                    p_s[s] = z_1
+                    q_s[s] = zero
+
+        size = rz
+        limit = tolerance[0] * tolerance[0] * size
+        count = int(0)
+        while count < most_iterations and rz > limit:
+            multiply(
+                nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
+                upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
+            )  # fmt: skip
+            pq = zero
+            for i in range(nodes):
+                pq += wp.dot(p_x[i], q_x[i])
+                if wp.static(sliding):
+                    pq += p_s[2 * i] * q_s[2 * i] + p_s[2 * i + 1] * q_s[2 * i + 1]
+            if not (pq > zero):
+                # past the attainable accuracy, or not finite
+                break
+            alpha = rz / pq
+            rz_next = zero
+            for i in range(nodes):
+                solution[i] = solution[i] + p_x[i] * alpha
+                r = r_x[i] - q_x[i] * alpha
+                rz_next += wp.dot(r, wp.cw_mul(inverse_x[i], r))
+                r_x[i] = r
+                q_x[i] = vec3()
+                if wp.static(sliding):
+                    for s in range(2 * i, 2 * i + 2):
+                        euler_solution[s] = euler_solution[s] + p_s[s] * alpha
+                        r_1 = r_s[s] - q_s[s] * alpha
+                        rz_next += r_1 * inverse_s[s] * r_1
+                        r_s[s] = r_1
+                        q_s[s] = zero
+            beta = rz_next / rz
+            rz = rz_next
+            for i in range(nodes):
+                p_x[i] = wp.cw_mul(inverse_x[i], r_x[i]) + p_x[i] * beta
+                if wp.static(sliding):
+                    for s in range(2 * i, 2 * i + 2):
+                        p_s[s] = inverse_s[s] * r_s[s] + p_s[s] * beta
+            count += 1
+
+        if report(count, rz, size, limit, iterations, residual, status):
+            worst = scalar(-1.0)
+            for i in range(nodes):
+                here = wp.dot(r_x[i], wp.cw_mul(inverse_x[i], r_x[i]))
+                if not (here <= worst):
+                    worst = here
+                    status[1] = i
+
+    return SimpleNamespace(apply_matrix=apply_matrix, jacobi_conjugate_gradient=jacobi_conjugate_gradient)

@@ -1,0 +1,146 @@
+"""Collision of parallel yarns: neighbouring crossings of a yarn keep a distance in (u, v) (paper 3.3).
+
+    V = ½ k_c L ReLU(d − Δs)²,   d = 4R between crossings flipped against each other, else 2R
+
+and never pass each other, nor the end of a yarn, which the penalty alone does not see to: below d̂ = 0.2 R stands the
+barrier of Li et al. (Incremental Potential Contact, 2020),
+
+    V = −(kₛ + k_c L)/d̂ · (Δs − d̂)² ln(Δs/d̂)
+
+convex, 0 with its first and second derivative from d̂ on, and without bound as Δs → 0. A segment that has collapsed to
+a point loses ½ kₛ of energy for every metre of yarn that leaves it: the barrier holds that at 0.65 d̂.
+
+Parameters: ``parallel_stiffness`` k_c [N/m]; ``stretch`` Y of each yarn [Pa], for kₛ = Y π R²; ``spacing`` L [m];
+``radius`` R [m].
+
+The matrix is the exact second derivative.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..core.indexing import index
+from ..core.variant import Term, Variant
+from . import stretch as stretching
+
+BARRIER = 0.2
+"""d̂, in radii: a tenth of the spacing, where yarns touch at rest."""
+
+
+@functools.cache
+def functions(variant: Variant) -> SimpleNamespace:
+    scalar, vec3 = variant.scalar, variant.vec3
+
+    @wp.func
+    def barrier(rest: scalar, reach: scalar, stiffness: scalar) -> vec3:
+        """(V, −V', V'') of the barrier; stiffness [N]."""
+        x = rest / reach
+        if x >= scalar(1.0):
+            return vec3()
+        left = scalar(1.0) - x
+        log = -wp.log(x)
+        return (
+            vec3(
+                reach * left * left * log,
+                left * (scalar(2.0) * log + left / x),
+                (scalar(2.0) * log + left * (scalar(4.0) + left / x) / x) / reach,
+            )
+            * stiffness
+        )
+
+    return SimpleNamespace(barrier=barrier)
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3 = variant.scalar, variant.vec3
+    barrier = functions(variant).barrier
+    stretch_stiffness = stretching.functions(variant).stiffness
+
+    @variant.kernel("terms")
+    def parallel_term(
+        # topology
+        segment_nodes: wp.array(dtype=wp.vec2i),
+        segment_yarn: wp.array(dtype=int),
+        yarn_direction: wp.array(dtype=int),
+        flipped: wp.array(dtype=int),
+        # parameters
+        parallel_stiffness: wp.array(dtype=scalar),
+        stretch: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+        # state in
+        euler: wp.array(dtype=scalar),
+        # forces out
+        euler_force: wp.array(dtype=scalar),
+        # matrix out
+        matrix: int,
+        weights: wp.array(dtype=vec3),
+        diagonal_ss: wp.array(dtype=scalar),
+        upper_ss: wp.array(dtype=scalar),
+    ):
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
+        sa = 2 * a + direction
+        sb = 2 * b + direction
+        distance = scalar(2.0) * radius[0]
+        if flipped[a] != flipped[b]:
+            distance = scalar(4.0) * radius[0]
+        rest = euler[sb] - euler[sa]
+        overlap = distance - rest
+        if overlap > scalar(0.0):
+            k = parallel_stiffness[0] * spacing[0]
+            reach = radius[0] * scalar(wp.static(BARRIER))
+            guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], radius[0]))
+            f = k * overlap + guard[1]
+            wp.atomic_add(euler_force, sa, -f)
+            wp.atomic_add(euler_force, sb, f)
+            if matrix != 0:
+                ss = weights[0][2] * (k + guard[2])
+                wp.atomic_add(diagonal_ss, sa, ss)
+                wp.atomic_add(diagonal_ss, sb, ss)
+                wp.atomic_add(upper_ss, 4 * a + direction, -ss)
+
+    return parallel_term
+
+
+def define_energy(variant: Variant) -> wp.Kernel:
+    scalar = variant.scalar
+    barrier = functions(variant).barrier
+    stretch_stiffness = stretching.functions(variant).stiffness
+
+    @variant.kernel("energy")
+    def parallel_energy(
+        segment_nodes: wp.array(dtype=wp.vec2i),
+        segment_yarn: wp.array(dtype=int),
+        yarn_direction: wp.array(dtype=int),
+        flipped: wp.array(dtype=int),
+        parallel_stiffness: wp.array(dtype=scalar),
+        stretch: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+        euler: wp.array(dtype=scalar),
+        energy: wp.array(dtype=scalar),
+    ):
+        e = wp.tid()
+        a = segment_nodes[e][0]
+        b = segment_nodes[e][1]
+        direction = yarn_direction[segment_yarn[e]]
+        distance = scalar(2.0) * radius[0]
+        if flipped[a] != flipped[b]:
+            distance = scalar(4.0) * radius[0]
+        rest = euler[2 * b + direction] - euler[2 * a + direction]
+        overlap = wp.max(distance - rest, scalar(0.0))
+        k = parallel_stiffness[0] * spacing[0]
+        reach = radius[0] * scalar(wp.static(BARRIER))
+        guard = barrier(rest, reach, k + stretch_stiffness(stretch[segment_yarn[e]], radius[0]))
+        wp.atomic_add(energy, 0, scalar(0.5) * k * overlap * overlap + guard[0])
+
+    return parallel_energy
+
+
+TERM = Term(name="parallel", elements="segments", define=define, energy=define_energy, stencil=2, sliding_only=True)

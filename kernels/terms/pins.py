@@ -1,0 +1,56 @@
+"""Pins that hold nodes by a spring.
+
+    V = ½ k_h |x − x_pin|²
+
+Parameters: ``pin_stiffness`` k_h [N/m]; ``pin_target`` x_pin of each pin [m]. Exact pins are no term: they take their
+nodes out of the system (``kernels/stepping/linear.py``).
+"""
+
+import warp as wp
+
+from ..core.indexing import index
+from ..core.variant import Term, Variant
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+
+    @variant.kernel("terms")
+    def pin_term(
+        pin_node: wp.array(dtype=int),
+        pin_stiffness: wp.array(dtype=scalar),
+        pin_target: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        force: wp.array(dtype=vec3),
+        matrix: int,
+        weights: wp.array(dtype=vec3),
+        diagonal_xx: wp.array(dtype=mat33),
+    ):
+        e = index(wp.tid())
+        i = index(pin_node[e])
+        wp.atomic_add(force, i, (pin_target[e] - position[i]) * pin_stiffness[0])
+        if matrix != 0:
+            wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (weights[0][2] * pin_stiffness[0]))
+
+    return pin_term
+
+
+def define_energy(variant: Variant) -> wp.Kernel:
+    scalar, vec3 = variant.scalar, variant.vec3
+
+    @variant.kernel("energy")
+    def pin_energy(
+        pin_node: wp.array(dtype=int),
+        pin_stiffness: wp.array(dtype=scalar),
+        pin_target: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        energy: wp.array(dtype=scalar),
+    ):
+        e = wp.tid()
+        offset = position[pin_node[e]] - pin_target[e]
+        wp.atomic_add(energy, 0, scalar(0.5) * pin_stiffness[0] * wp.dot(offset, offset))
+
+    return pin_energy
+
+
+TERM = Term(name="pins", elements="pins", define=define, energy=define_energy)

@@ -1,0 +1,79 @@
+"""Wind on the cloth's triangles, two to a cell of the grid.
+
+    F = ρ_w A |v_n| v_n n + c_d A (v_r − v_n n),   v_r = wind − mean vertex velocity,   v_n = n·v_r
+
+a third of it on each vertex.
+
+Parameters: ``wind_velocity`` [m/s]; ``wind_density`` ρ_w [kg/m³]; ``wind_drag`` c_d [kg/(m² s)].
+
+The matrix holds the exact derivative by velocity, which is symmetric positive semi-definite:
+−∂F/∂v = A (2 ρ_w |v_n| n nᵀ + c_d (I − n nᵀ)). The derivative by position is not symmetric, and left out.
+"""
+
+import warp as wp
+
+from ..core.indexing import index
+from ..core.variant import Term, Variant
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+
+    @variant.kernel("terms")
+    def wind_term(
+        # topology
+        triangle_nodes: wp.array(dtype=wp.vec3i),
+        triangle_blocks: wp.array(dtype=wp.vec3i),
+        # parameters
+        wind_velocity: wp.array(dtype=vec3),
+        wind_density: wp.array(dtype=scalar),
+        wind_drag: wp.array(dtype=scalar),
+        # state in
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        # forces and momentum out
+        force: wp.array(dtype=vec3),
+        momentum: wp.array(dtype=vec3),
+        # matrix out
+        matrix: int,
+        weights: wp.array(dtype=vec3),
+        diagonal_xx: wp.array(dtype=mat33),
+        upper_xx: wp.array(dtype=mat33),
+    ):
+        e = index(wp.tid())
+        i = index(triangle_nodes[e][0])
+        j = index(triangle_nodes[e][1])
+        k = index(triangle_nodes[e][2])
+        third = scalar(wp.static(1.0 / 3.0))
+        cross = wp.cross(position[j] - position[i], position[k] - position[i])
+        area = scalar(0.5) * wp.length(cross)
+        n = wp.normalize(cross)
+        mean_velocity = (velocity[i] + velocity[j] + velocity[k]) * third
+        relative = wind_velocity[0] - mean_velocity
+        v_n = wp.dot(n, relative)
+        pressure = wind_density[0] * area * wp.abs(v_n)
+        drag = wind_drag[0] * area
+        f = (n * (v_n * (pressure - drag)) + relative * drag) * third
+        wp.atomic_add(force, i, f)
+        wp.atomic_add(force, j, f)
+        wp.atomic_add(force, k, f)
+
+        if matrix != 0:
+            h = weights[0][1] * third * third
+            xx = wp.outer(n, n) * ((scalar(2.0) * pressure - drag) * h) + wp.identity(n=3, dtype=scalar) * (drag * h)
+            p = xx * (mean_velocity * scalar(3.0))
+            wp.atomic_add(momentum, i, p)
+            wp.atomic_add(momentum, j, p)
+            wp.atomic_add(momentum, k, p)
+            wp.atomic_add(diagonal_xx, i, xx)
+            wp.atomic_add(diagonal_xx, j, xx)
+            wp.atomic_add(diagonal_xx, k, xx)
+            blocks = triangle_blocks[e]
+            wp.atomic_add(upper_xx, index(blocks[0]), xx)
+            wp.atomic_add(upper_xx, index(blocks[1]), xx)
+            wp.atomic_add(upper_xx, index(blocks[2]), xx)
+
+    return wind_term
+
+
+TERM = Term(name="wind", elements="triangles", define=define, stencil=6)

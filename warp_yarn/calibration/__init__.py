@@ -1,0 +1,1 @@
+"""Learning what cloth is made of from recorded motion, with uncertainties."""

@@ -1,0 +1,177 @@
+"""Trajectories as USD files."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError, number, whole
+from ..simulation.state import Trajectory
+from ..view.geometry import Strands, Tubes, strands
+from .files import whole_file
+
+if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
+    from pxr import UsdGeom
+
+ENDINGS = (".usd", ".usda", ".usdc")
+COARSE = 1e-4
+TUBE_SAMPLES = 4
+"""Rings a segment: chords between them are within 7 % of the radius of the curve, in the paper's weaves."""
+
+
+def write_usd(
+    path: str | os.PathLike,
+    trajectory: Trajectory,
+    *,
+    tubes: bool = False,
+    slowdown: float = 1.0,
+    sides: int = 8,
+) -> None:
+    """Writes every frame of a trajectory as a USD file: /cloth, and below it one prim for each yarn material.
+
+    Yarns are cubic Catmull-Rom curves (``UsdGeom.BasisCurves``) with their end points repeated, as wide as the yarn,
+    over and under each other as the draft says. Frame k is at time code k. Lengths are in metres, z is up.
+    Points are in single precision. Where that would be too coarse, far from the origin, they are relative to a
+    translation of /cloth, which is in double precision. The file appears whole or not at all; stages of this process
+    that have an older one open show the new one.
+
+    Args:
+        path: of the file, ending in .usd, .usda (text) or .usdc (binary).
+        trajectory: what to write, at least one frame.
+        tubes: write meshes around the same curves, for programs that do not draw curves: closed tubes, their vertices
+            at the yarn's radius. They are subdivision surfaces, so that programs draw them smooth; one that
+            subdivides them draws them thinner, by 10 % with 8 sides.
+        slowdown: seconds of playing time for one second of simulated time, above 0.
+        sides: corners of a tube's ring, at least 3.
+
+    Raises:
+        InputError: an argument is out of its range, or the folder of `path` does not exist.
+        OSError: the file cannot be written, such as to a full disk.
+    """
+    slowdown = number("slowdown", slowdown, above=0.0)
+    sides = whole("sides", sides, least=3)
+    if Path(path).suffix not in ENDINGS:
+        raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
+    parts = strands(trajectory)
+    with whole_file(path) as temporary, writing(path):
+        # a function of its own, so that no stage holds the file when it is moved: Windows would not move it
+        _write_stage(temporary, trajectory, parts, tubes=tubes, rate=1.0 / (trajectory.step * slowdown), sides=sides)
+    reload(path)
+
+
+@contextlib.contextmanager
+def writing(path: str | os.PathLike) -> Iterator[None]:
+    """Turns what USD says of a file that it cannot write into an OSError."""
+    from pxr import Tf
+
+    try:
+        yield
+    except Tf.ErrorException as error:
+        lines = [line for line in str(error).splitlines() if line.strip()]
+        raise OSError(f"{path} cannot be written: {lines[0].rpartition(' : ')[2]}") from error
+
+
+def reload(path: str | os.PathLike) -> None:
+    """Makes USD read a file again, where this process has it open: it keeps layers by their paths."""
+    from pxr import Sdf
+
+    real = os.path.realpath(path)
+    for layer in Sdf.Layer.GetLoadedLayers():
+        if layer.realPath and os.path.realpath(layer.realPath) == real:
+            layer.Reload(force=True)
+
+
+def _write_stage(
+    path: Path, trajectory: Trajectory, parts: list[Strands], *, tubes: bool, rate: float, sides: int
+) -> None:
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(trajectory) - 1)
+    cloth = UsdGeom.Xform.Define(stage, "/cloth")
+    stage.SetDefaultPrim(cloth.GetPrim())
+    radius = trajectory.cloth.radius
+    origin = origins(trajectory)
+    if origin.any():
+        translate = cloth.AddTranslateOp()
+        if (origin == origin[0]).all():
+            translate.Set(Gf.Vec3d(*origin[0].tolist()))
+        else:
+            for frame, place in enumerate(origin.tolist()):
+                translate.Set(Gf.Vec3d(*place), frame)
+    for part in parts:
+        prim_path = cloth.GetPath().AppendChild(f"yarn_{part.material}")
+        if tubes:
+            shape = Tubes.around(part, radius, sides=sides, samples=TUBE_SAMPLES)
+            _write_mesh(UsdGeom.Mesh.Define(stage, prim_path), shape, part, origin)
+        else:
+            _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, radius, origin)
+    stage.Save()
+
+
+def origins(trajectory: Trajectory) -> np.ndarray:
+    """Where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would move
+    them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
+    position = trajectory.position
+    low, high = position.min(axis=1), position.max(axis=1)
+    reach = COARSE * trajectory.cloth.radius / np.finfo(np.float32).epsneg
+    middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
+    for origin in (np.zeros(3), middle):
+        if max(np.abs(low - origin).max(), np.abs(high - origin).max()) <= reach:
+            return np.broadcast_to(origin, (len(position), 3))
+    return 0.5 * (low + high)
+
+
+def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, origin: np.ndarray) -> None:
+    from pxr import UsdGeom, Vt
+
+    curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
+    curves.CreateBasisAttr(UsdGeom.Tokens.catmullRom)
+    # Repeated end points instead of `pinned`, whose segments Storm miscounts.
+    curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
+    curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy((part.counts + 2).astype(np.int32)))
+    curves.CreateWidthsAttr([2.0 * radius])
+    curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+    _write_color(curves, part)
+    repeated = part.repeated
+    for frame, points in enumerate(part.points):
+        _write_points(curves, frame, points[repeated] - origin[frame], radius)
+
+
+def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndarray) -> None:
+    from pxr import Vt
+
+    corners, vertices = shape.faces()
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(corners.astype(np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(vertices.astype(np.int32)))
+    _write_color(mesh, part)
+    for frame in range(len(part.points)):
+        _write_points(mesh, frame, shape.vertices(frame) - origin[frame], 0.0)
+
+
+def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
+    """displayColor is linear; the colours of yarns are those of a screen (sRGB)."""
+    from pxr import Gf, UsdGeom
+
+    color = np.array(part.color, dtype=np.float64)
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*linear.tolist())])
+
+
+def _write_points(shape: UsdGeom.PointBased, frame: int, points: np.ndarray, margin: float) -> None:
+    from pxr import Vt
+
+    points = points.astype(np.float32)
+    shape.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), frame)
+    extent = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
+    shape.GetExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent.astype(np.float32)), frame)

@@ -1,0 +1,1 @@
+"""The paper's yarns and scene, and fabrics by name."""

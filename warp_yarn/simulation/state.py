@@ -1,0 +1,246 @@
+"""The state of a cloth, and a sequence of states."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
+from ..description.scene import Scene, Wind
+from ..description.weave import Weave
+from ..errors import InputError, finite_array, number, whole
+from ..io.files import whole_file
+
+FORMAT = 2
+"""Of recordings: 1 had no number, no scene and no count of steps."""
+
+
+@dataclasses.dataclass(eq=False)
+class State:
+    """Where every node is, and how it moves. NumPy, float64.
+
+    Args:
+        position: x [nodes, 3] (m).
+        euler: (u, v) [nodes, 2] (m).
+        velocity: ẋ [nodes, 3] (m/s).
+        euler_velocity: (u̇, v̇) [nodes, 2] (m/s).
+        anchor: (ū, v̄), where friction's springs are anchored [nodes, 2] (m); None: at (u, v), no spring is strained.
+    """
+
+    position: np.ndarray
+    euler: np.ndarray
+    velocity: np.ndarray
+    euler_velocity: np.ndarray
+    anchor: np.ndarray | None = None
+
+    def __eq__(self, other: object) -> bool:
+        """Whether two are the same, to the last bit."""
+        if not isinstance(other, State):
+            return NotImplemented
+        pairs = [(getattr(self, name), getattr(other, name)) for name in FIELDS[:-1]]
+        anchors = (state.euler if state.anchor is None else state.anchor for state in (self, other))
+        return all(np.array_equal(a, b) for a, b in [*pairs, tuple(anchors)])
+
+    def checked(self, nodes: int) -> State:
+        """A copy with every array finite and of the right shape, and Δs > 0 left to the simulator; or an InputError."""
+        euler = finite_array("state.euler", self.euler, (nodes, 2))
+        return State(
+            finite_array("state.position", self.position, (nodes, 3)),
+            euler,
+            finite_array("state.velocity", self.velocity, (nodes, 3)),
+            finite_array("state.euler_velocity", self.euler_velocity, (nodes, 2)),
+            euler.copy() if self.anchor is None else finite_array("state.anchor", self.anchor, (nodes, 2)),
+        )
+
+
+FIELDS = tuple(field.name for field in dataclasses.fields(State))
+WIDTHS = {"position": 3, "euler": 2, "velocity": 3, "euler_velocity": 2, "anchor": 2}
+"""Numbers of a node."""
+
+
+@dataclasses.dataclass(eq=False)
+class Trajectory:
+    """Every frame of a simulation, the initial state first: arrays as in State, with a leading axis of frames.
+
+    A simulator goes on from one by ``simulator.state = trajectory[-1]`` and
+    ``simulator.steps_done = trajectory.steps_done``.
+    """
+
+    cloth: Cloth
+    step: float
+    """Time from frame to frame [s]."""
+    position: np.ndarray
+    euler: np.ndarray
+    velocity: np.ndarray
+    euler_velocity: np.ndarray
+    anchor: np.ndarray
+    scene: Scene | None = None
+    """What was simulated; None: not known."""
+    start: int = 0
+    """Steps made before the first frame."""
+
+    @property
+    def steps_done(self) -> int:
+        """Steps made until the last frame."""
+        return self.start + len(self) - 1
+
+    def __eq__(self, other: object) -> bool:
+        """Whether two have the same frames of the same cloth, to the last bit."""
+        if not isinstance(other, Trajectory):
+            return NotImplemented
+        if not self.cloth.same_as(other.cloth) or (self.step, self.start) != (other.step, other.start):
+            return False
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in FIELDS)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def __getitem__(self, frame: int) -> State:
+        """One frame, as a State; negative frames count from the end."""
+        return State(*(getattr(self, name)[frame].copy() for name in FIELDS))
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time of every frame [s]."""
+        return np.arange(len(self)) * self.step
+
+    def cut(self, frames: int) -> Trajectory:
+        """The first frames of it."""
+        parts: dict[str, Any] = {name: getattr(self, name)[:frames] for name in FIELDS}
+        return dataclasses.replace(self, **parts)
+
+    def joined(self, later: Trajectory) -> Trajectory:
+        """This and a run that went on from its last frame.
+
+        Raises:
+            InputError: it did not: its cloth, scene, step, steps before it or first frame (beyond what single precision
+                keeps) are others.
+        """
+        if not isinstance(later, Trajectory):
+            raise InputError(f"later = {later!r}, must be a Trajectory")
+        if not len(self) or not len(later):
+            raise InputError(f"trajectories of {len(self)} and {len(later)} frames, must have at least one each")
+        if later.step != self.step:
+            raise InputError(f"later.step = {later.step:g}, must be that of the frames before, {self.step:g}")
+        if not later.cloth.same_as(self.cloth):
+            raise InputError("later.cloth is another one than that of the frames before")
+        if self.scene is not None and later.scene is not None and not later.scene.same_as(self.scene):
+            raise InputError("later.scene is another one than that of the frames before")
+        if later.start != self.steps_done:
+            raise InputError(f"later.start = {later.start}, must be the steps until here, {self.steps_done}")
+        for name in FIELDS:
+            end, begin = getattr(self, name)[-1], getattr(later, name)[0]
+            off = np.abs(begin - end).max()
+            if off > 1e-6 * np.ptp(end, axis=0).max():
+                raise InputError(f"later.{name}[0] is off by {off:g}, must be the last frame here")
+        parts: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(later, name)[1:]]) for name in FIELDS
+        }
+        return dataclasses.replace(self, **parts)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes an .npz file with the cloth, its scene and every frame; it appears whole or not at all."""
+        cloth = self.cloth
+        yarns = np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns])
+        colors = np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns])
+        numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
+        with whole_file(path) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(
+                file,
+                format=FORMAT,
+                start=self.start,
+                draft=cloth.weave.flipped,
+                weave=cloth.weave.name,
+                yarns=yarns,
+                colors=colors,
+                warp=cloth.warp,
+                weft=cloth.weft,
+                rest=cloth.position,
+                step=self.step,
+                **numbers,
+                **{name: getattr(self, name) for name in FIELDS},
+                **({} if self.scene is None else _packed(self.scene)),
+            )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Trajectory:
+        """Reads what ``save`` wrote; an InputError says what is wrong with the file."""
+        try:
+            with np.load(path) as data:
+                written = whole("format", data["format"].item(), least=1) if "format" in data else 1
+                if written > FORMAT:
+                    raise InputError(f"format = {written}, this warp_yarn reads up to {FORMAT}: it needs a newer one")
+                yarns = [
+                    Yarn(density=d, stretch=s, bend=b, color=None if np.isnan(color).any() else tuple(color.tolist()))
+                    for (d, s, b), color in zip(data["yarns"].tolist(), data["colors"], strict=True)
+                ]
+                cloth = Cloth(
+                    Weave(data["draft"], str(data["weave"])),
+                    yarns=yarns,
+                    warp=data["warp"].tolist(),
+                    weft=data["weft"].tolist(),
+                    pose=data["rest"],
+                    **{name: data[name].item() for name in CLOTH_NUMBERS},
+                )
+                frames = len(np.atleast_1d(data["position"]))
+                if not frames:
+                    raise InputError("has no frame, must have at least one")
+                values: dict[str, Any] = {
+                    name: finite_array(name, data[name], (frames, cloth.nodes, WIDTHS[name])) for name in FIELDS
+                }
+                return cls(
+                    cloth,
+                    number("step", data["step"].item(), above=0.0),
+                    **values,
+                    scene=_unpacked(cloth, data) if "scene_terms" in data else None,
+                    start=whole("start", data["start"].item(), least=0) if "start" in data else 0,
+                )
+        except FileNotFoundError as error:
+            raise InputError(f"{Path(path)}: there is no such file") from error
+        except InputError as error:
+            raise InputError(f"{Path(path)}: {error}") from error
+        except Exception as error:  # zip, pickle and key errors of a foreign or truncated file
+            raise InputError(f"{Path(path)}: not a recording of warp_yarn ({error})") from error
+
+
+def _packed(scene: Scene) -> dict[str, Any]:
+    """A scene as arrays; what is None is left out."""
+    wind = scene.wind
+    values = {
+        "terms": np.array(scene.terms),
+        "sliding": scene.sliding,
+        "published_scaling": scene.published_scaling,
+        "gravity": scene.gravity,
+        "pins": scene.pins,
+        "pin_stiffness": scene.pin_stiffness,
+        "pin_path": scene.pin_path,
+        "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
+        "force_nodes": scene.force_nodes,
+        **{f"force_{node}": force for node, force in scene.forces.items()},
+    }
+    return {f"scene_{name}": value for name, value in values.items() if value is not None}
+
+
+def _unpacked(cloth: Cloth, data: Any) -> Scene:
+    """The scene that ``_packed`` made arrays of."""
+
+    def value(name: str) -> Any:
+        return data.get(f"scene_{name}")
+
+    wind, stiffness = value("wind"), value("pin_stiffness")
+    return Scene(
+        cloth,
+        gravity=value("gravity"),
+        wind=None if wind is None else Wind(velocity=wind[:3], density=wind[3], drag=wind[4]),
+        pins=value("pins"),
+        pin_stiffness=None if stiffness is None else stiffness.item(),
+        pin_path=value("pin_path"),
+        forces={node: value(f"force_{node}") for node in value("force_nodes").tolist()},
+        sliding=value("sliding").item(),
+        terms=value("terms").tolist(),
+        published_scaling=value("published_scaling").item(),
+    )

@@ -1,0 +1,4 @@
+"""What yarns look like: strands, tubes, pictures and movies.
+
+Imports no simulator.
+"""
