@@ -56,8 +56,10 @@ def test_a_read_only_folder_is_found_before():
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "SIGINT"])
 def test_a_process_that_is_ended_leaves_nothing(tmp_path, number):
     code = (
-        "import sys, time\n"
-        "from warp_yarn.files import whole_file\n"
+        "import signal, sys, time\n"
+        "from warp_yarn.io.files import whole_file\n"
+        # a shell's background jobs ignore it
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "with whole_file(sys.argv[1]) as temporary:\n"
         "    temporary.write_text('half')\n"
         "    print('begun', flush=True)\n"

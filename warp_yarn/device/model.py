@@ -417,7 +417,7 @@ class Model:
         """Lets all steps pass, until ``forget_energy``: steps that are made again, from the middle of a run, were
         watched the first time."""
         a = self.arrays
-        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0)
+        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0, 0.0)
         a.put("audit_due", 0)
         a.put("steps_to_audit", np.iinfo(np.int32).max)
 

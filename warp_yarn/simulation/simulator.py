@@ -105,8 +105,10 @@ class Simulator:
         step_error: how far any node may be put wrong in a part of a step, in spacings of the yarns; each step is then
             made in as many parts as that takes, and ``step`` is the time from frame to frame. For "sdirk2", whose
             stages tell its error. None: steps are made at once.
+        energy_watch: whether a step that gains energy from nowhere is made again, and ends the run where that does not
+            help (``docs/solver.md``). False is for who wants a method as it is, such as the paper's eq. 2.
         chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
-        differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.gradients.rollout`` asks for it.
+        differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
 
     Attributes:
         state: the present state, as a copy; set it to start from another one. ``steps_done`` stays as it is then.
@@ -135,6 +137,7 @@ class Simulator:
         max_iterations: int | None = None,
         threads: int = 1,
         step_error: float | None = None,
+        energy_watch: bool = True,
         chunk: int | None = None,
         differentiable: bool = False,
     ):
@@ -158,6 +161,7 @@ class Simulator:
             "max_iterations": max_iterations,
             "threads": threads,
             "step_error": step_error,
+            "energy_watch": energy_watch,
             "chunk": chunk,
             "differentiable": differentiable,
         }
@@ -176,6 +180,7 @@ class Simulator:
                 threads=threads,
                 differentiable=differentiable,
             )
+            self.model.watches = self.model.watches and bool(energy_watch)
             refuse_recording(self.model.device)
             self._options["device"] = str(self.model.device)
             self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
