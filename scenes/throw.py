@@ -41,8 +41,8 @@ HALVINGS = 20
 """How often a throw that cannot be simulated is moved half the way back before the search gives up."""
 AS_PUBLISHED: dict[str, Any] = {"integrator": "linear", "energy_watch": False}
 """Eq. 2: where momentum decides, not stiffness, one linear solve a step is enough, and the violent forces that a search
-tries need no more. In its first step corners that are pulled out of the flat cloth stretch yarns for which eq. 2 does not
-ask: energy from nowhere, of which the next steps damp all."""
+tries need no more. Its first step stretches yarns where corners are pulled out of the flat cloth, which is energy from
+nowhere, and the next steps damp it."""
 
 
 class Throw:

@@ -210,18 +210,23 @@ def test_crossings_never_change_their_order(method: str, terms: list[str]) -> No
 
 
 def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
-    """As the square of steps that are shorter than four of the times in which a stretch wave passes a segment."""
+    """As the square of steps that are shorter than four of the times in which a stretch wave passes a segment, and as the
+    inverse of those that are longer than √1000 of the fastest."""
     soft = dataclasses.replace(wy.paper.YARNS[1], stretch=1.0e5)
     fabric = wy.Cloth(wy.Weave.plain(rows=4, columns=4), yarns=[wy.paper.YARNS[1], soft])
-    wave = fabric.spacing / np.sqrt(1.0e5 * np.pi * fabric.radius**2 / soft.density)
+    wave, fastest = (
+        fabric.spacing / np.sqrt(stretch * np.pi * fabric.radius**2 / soft.density) for stretch in (1.0e5, 5.0e5)
+    )
 
     def tolerance(step: float, **options: object) -> float:
         return wy.Simulator(wy.Scene(fabric), step=step, **options).model.newton_tolerance_at(step)
 
-    assert tolerance(1e-2) == tolerance(4.001 * wave) == 1e-3
-    assert tolerance(wave) == pytest.approx(1e-3 / 16, rel=1e-12)
+    assert tolerance(4.001 * wave) == 2e-2
+    assert tolerance(wave) == pytest.approx(2e-2 / 16, rel=1e-12)
+    assert tolerance(100.0 * fastest) == pytest.approx(2e-2 * np.sqrt(1e3) / 100.0, rel=1e-12)
+    assert tolerance(1.0) == 2e-4 and tolerance(1.0, precision="single") == 2e-3
     assert tolerance(1e-9) == tolerance(wave, differentiable=True) == 1e-8
-    assert tolerance(wave, precision="single") == 1e-3
+    assert tolerance(wave, precision="single") == 2e-2
 
 
 @pytest.mark.parametrize("step", [2e-3, 5e-4, 1.25e-4])

@@ -62,13 +62,14 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         rest = euler[2 * b + direction] - euler[2 * a + direction]
         height = wp.dot(gravity[0], position[a] + position[b])
-        wp.atomic_add(energy, 0, scalar(-0.5) * density[segment_yarn[e]] * rest * height)
+        wp.atomic_add(energy, 0, scalar(-0.5) * density[yarn] * rest * height)
 
     return gravity_energy
 

@@ -197,10 +197,11 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler_velocity: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
@@ -210,7 +211,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
             w = (position[b] - position[a]) / rest
             va -= w * euler_velocity[sa]
             vb -= w * euler_velocity[sb]
-        m = density[segment_yarn[e]] * rest * scalar(wp.static(1.0 / 6.0))
+        m = density[yarn] * rest * scalar(wp.static(1.0 / 6.0))
         wp.atomic_add(energy, 0, m * (wp.dot(va, va) + wp.dot(va, vb) + wp.dot(vb, vb)))
 
     return kinetic_energy

@@ -132,13 +132,14 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        e = index(wp.tid())
+        a = index(segment_nodes[e][0])
+        b = index(segment_nodes[e][1])
+        yarn = index(segment_yarn[e])
+        direction = index(yarn_direction[yarn])
         rest = euler[2 * b + direction] - euler[2 * a + direction]
         strain = wp.length(position[b] - position[a]) / rest - scalar(1.0)
-        k = stretch_stiffness(stretch[segment_yarn[e]], radius[0])
+        k = stretch_stiffness(stretch[yarn], radius[0])
         wp.atomic_add(energy, 0, scalar(0.5) * k * rest * strain * strain)
 
     return stretch_energy

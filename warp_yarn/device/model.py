@@ -48,7 +48,11 @@ PRECONDITIONERS = ("multilevel", "incomplete", "jacobi")
 PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
-NEWTON_TOLERANCE = 1e-3
+NEWTON_TOLERANCE = 2e-2
+SLOW = 1e3
+"""k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error smaller,
+as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
+TIGHT = {"double": 1e-2, "single": 1e-1}
 STIFF = 2e4
 """k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch
 wave runs over a hundred crossings in a step."""
@@ -155,7 +159,10 @@ class Model:
         """As given, or what follows the error of steps of this size."""
         if self._newton_tolerance is not None:
             return self._newton_tolerance
-        return max(EXACT, NEWTON_TOLERANCE * min(1.0, step * self._resolving) ** 2)
+        fastest = float(self._stretch_rate().max())
+        slow = min(1.0, math.sqrt(SLOW) / (fastest * step)) if fastest > 0.0 else 1.0
+        resolved = min(1.0, step * self._resolving) ** 2
+        return max(EXACT, NEWTON_TOLERANCE * max(TIGHT[self.precision], slow) * resolved)
 
     def _resolving_rate(self) -> float:
         """Of steps that begin to resolve the yarns' stretching [1/s]."""
