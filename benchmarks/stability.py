@@ -30,6 +30,7 @@ import numpy as np
 import tqdm
 import warp as wp
 from common import RESULTS, environment, one_core, write_csv
+from plots import PICTURES
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -253,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--fabric", choices=FABRICS, default="paper", help="of the maps (%(default)s)")
     text = "in the fabric's, a map for each (%(default)s)"
     parser.add_argument("--densities", type=float, nargs="+", default=list(DENSITY), metavar="X", help=text)
-    parser.add_argument("--png", type=Path, default=Path("docs/stability.png"), help="(%(default)s)")
+    parser.add_argument("--png", type=Path, default=PICTURES / "stability.png", help="(%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "stability.csv", help="CSV file (%(default)s)")
     options = parser.parse_args(arguments)
     one_core()
