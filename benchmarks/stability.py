@@ -30,11 +30,11 @@ import numpy as np
 import tqdm
 import warp as wp
 from common import RESULTS, environment, one_core, write_csv
-from plots import PICTURES
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from plots import PICTURES
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS

@@ -210,8 +210,8 @@ def test_crossings_never_change_their_order(method: str, terms: list[str]) -> No
 
 
 def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
-    """As the square of steps that are shorter than four of the times in which a stretch wave passes a segment, and as the
-    inverse of those that are longer than √1000 of the fastest."""
+    """As the square of steps that are shorter than four of the times in which a stretch wave passes a segment, and as
+    the inverse of those that are longer than √1000 of the fastest."""
     soft = dataclasses.replace(wy.paper.YARNS[1], stretch=1.0e5)
     fabric = wy.Cloth(wy.Weave.plain(rows=4, columns=4), yarns=[wy.paper.YARNS[1], soft])
     wave, fastest = (

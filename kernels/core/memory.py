@@ -22,6 +22,7 @@ _ROWS = """
     struct row {
         SCALAR c[4];
         CUDA_CALLABLE SCALAR operator[](int k) const { return c[k]; }
+        CUDA_CALLABLE SCALAR& operator[](int k) { return c[k]; }
         CUDA_CALLABLE row operator*(SCALAR s) const { return {c[0] * s, c[1] * s, c[2] * s, c[3] * s}; }
         CUDA_CALLABLE row operator*(row o) const { return {c[0] * o[0], c[1] * o[1], c[2] * o[2], c[3] * o[3]}; }
         CUDA_CALLABLE row operator+(row o) const { return {c[0] + o[0], c[1] + o[1], c[2] + o[2], c[3] + o[3]}; }

@@ -50,8 +50,8 @@ TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
 NEWTON_TOLERANCE = 2e-2
 SLOW = 1e3
-"""k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error smaller,
-as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
+"""k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error
+smaller, as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
 TIGHT = {"double": 1e-2, "single": 1e-1}
 STIFF = 2e4
 """k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch
