@@ -271,3 +271,21 @@ def test_steps_that_a_gradient_makes_again_raise_no_alarm():
         rollout(velocity=velocity).position[-1].square().sum().backward()
         gradients.append(velocity.grad.numpy())
     np.testing.assert_allclose(gradients[0], gradients[1], rtol=0.0, atol=1e-9 * np.abs(gradients[0]).max())
+
+
+@pytest.mark.parametrize("step", [2e-3, 1 / 60])
+def test_wind_that_takes_a_light_cloth_along_is_no_gain(step):
+    """Its power falls within a step, so that a second-order method is off by some percent of what it does."""
+    cloth = FABRICS["cotton"](rows=7, columns=8, pose="flat")
+    simulator = wy.Simulator(wy.Scene(cloth, wind=wy.Wind(velocity=(0.0, 0.0, 5.0))), step=step)
+    simulator.run(24)
+    assert not simulator.split_steps
+
+
+def test_a_cloth_that_swings_raises_no_alarm_at_its_highest():
+    """There it has next to no energy but gravity's."""
+    cloth = FABRICS["cotton"](rows=9, columns=9, pose="flat")
+    edge = [cloth.node(0, column) for column in range(9)]
+    simulator = wy.Simulator(wy.Scene(cloth, pins=edge, pin_stiffness=None, sliding=False), step=5e-3)
+    simulator.run(50)
+    assert not simulator.split_steps

@@ -228,3 +228,22 @@ def test_pins_at_1_m_s_do_not_disturb_what_they_carry(fabric, method):
     motion = norm(still - still[0], axis=2).max()
     # a path that is given from step to step is followed evenly within it, which is exact at a steady velocity
     assert norm(who.inside(simulator.run(FRAMES_SEEN)) - still, axis=2).max() < 1e-6 * motion
+
+
+@pytest.mark.parametrize("sliding", [True, False])
+def test_long_steps_of_a_light_cloth_fall_as_short_ones(sliding):
+    """The solver starts where the cloth moves as one, so that its tolerance leaves nothing of the fall out."""
+    cloth = wy.fabrics.handkerchief(rows=7, columns=8, pose="flat")
+    velocity = wy.Simulator(wy.Scene(cloth, sliding=sliding), step=1 / 60).run(24).velocity[-1]
+    assert np.abs(velocity - [0.0, 0.0, -9.8 * 24 / 60]).max() < 1e-6 * 9.8 * 24 / 60
+
+
+@pytest.mark.parametrize("fabric", FABRICS)
+def test_a_stage_that_is_solved_at_once_says_nothing_of_the_next(fabric):
+    """A stiff cloth that spins: its first stage is that of a body that moves as one, its second one is not."""
+    simulator = wy.Simulator(wy.Scene(flat(fabric, 5), sliding=False), step=2e-3)
+    state = simulator.state
+    state.velocity[:] = spinning(state.position)
+    simulator.state = state
+    simulator.run(24)
+    assert not simulator.split_steps

@@ -37,6 +37,8 @@ SLOW = 0.3
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
 CAUTION = 4.0
 """What a step of the iteration leaves is taken to be so many times what the contraction before it says."""
+TRUSTED = 1e-3
+"""The least contraction that is believed: a cloth that moves as one is solved at once, and what comes next is not."""
 TURNING = 0.03
 """Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one
 iteration did with that of the first stage, above 0.045, two to seven, and one or two with its own (17 × 17)."""
@@ -49,7 +51,7 @@ COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
-    at = access(variant).at
+    at, put = access(variant).at, access(variant).put
     module = variant.module("stage")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -140,6 +142,22 @@ def define(variant: Variant) -> SimpleNamespace:
         wp.atomic_add(node_mass, index(segment_nodes[e][1]), m)
 
     @wp.kernel(module=module, enable_backward=False)
+    def start_rigid(
+        nodes: int,
+        node_mass: wp.array(dtype=scalar),
+        rhs: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+    ):
+        """δ of a free cloth that moves as one: the solver need not find how it falls, to its tolerance."""
+        momentum = vec3()
+        mass = scalar(0.0)
+        for i in range(nodes):
+            momentum += at(rhs, i)
+            mass += at(node_mass, i)
+        for i in range(nodes):
+            put(direction, i, momentum / mass)
+
+    @wp.kernel(module=module, enable_backward=False)
     def search(
         nodes: int,
         node_mass: wp.array(dtype=scalar),
@@ -204,7 +222,7 @@ def define(variant: Variant) -> SimpleNamespace:
         norm = wp.sqrt(wp.max(slope[0], scalar(0.0)))
         left = scalar(CAUTION)
         if steps[0] > 0:
-            contraction[0] = norm / last_norm[0]
+            contraction[0] = wp.max(norm / last_norm[0], scalar(TRUSTED))
             left *= contraction[0]
         elif stage == 0:
             # not known of a time step's first
@@ -430,6 +448,7 @@ def define(variant: Variant) -> SimpleNamespace:
         look_ahead=look_ahead,
         correct=correct,
         lump_mass=lump_mass,
+        start_rigid=start_rigid,
         search=search,
         decide=decide,
         judge=judge,

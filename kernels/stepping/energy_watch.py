@@ -34,6 +34,8 @@ SUDDEN = 0.1
 """Part of the energy that yarns give or take in a step that is looked at closely."""
 ALERT = 16
 """Steps after that, or after a gain, that are looked at closely too."""
+FORGET = 256.0
+"""Steps in which the most energy of late is forgotten."""
 STILL = 1.0e-6
 """Speed of the whole cloth whose energy may always be gained [m/s]: rounding."""
 
@@ -48,7 +50,7 @@ def define(variant: Variant) -> SimpleNamespace:
         energy: wp.array(dtype=scalar),
         height_energy: wp.array(dtype=scalar),
         # E + W since the last audit, and since the start; energy beside gravity at the last audit; the last step's
-        # power, its yarns' energy, and energy beside gravity
+        # power, its yarns' energy, and energy beside gravity; the most of that of late
         elastic_energy: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
         steps_to_audit: wp.array(dtype=int),
@@ -61,6 +63,7 @@ def define(variant: Variant) -> SimpleNamespace:
             bounds[0] = total
             bounds[1] = total
             bounds[4] = elastic_energy[0]
+            bounds[6] = energy[0] + elastic_energy[0]
         else:
             bounds[0] = wp.min(bounds[0], total)
         bounds[2] = energy[0] + elastic_energy[0]
@@ -150,13 +153,15 @@ def define(variant: Variant) -> SimpleNamespace:
             # methods take the force or the velocity of either end: the largest that the power may have been
             work = wp.max(wp.max(power[0], power[1]), bounds[3]) * step_size[0]
             if by_stages != 0:
-                # what the method itself makes of it
-                work = stage_work[0]
+                # what the method itself makes of it; its own error where wind takes a light cloth along is no gain
+                work = wp.max(work, stage_work[0])
             inner = energy[0] + elastic_energy[0]
             total = inner + height_energy[0]
             # what there was at the last audit, or at the last step
             before = wp.max(bounds[2], bounds[5])
-            room = scalar(GAIN) * wp.max(inner, before) + still_energy[0] + scalar(1.0e-9) * wp.abs(height_energy[0])
+            # the most of late: a cloth that swings has none of it at its highest
+            most = wp.max(wp.max(inner, before), bounds[6])
+            room = scalar(GAIN) * most + still_energy[0] + scalar(1.0e-9) * wp.abs(height_energy[0])
             if gain[0] > scalar(GAIN) or by_stages == 0:
                 room += scalar(BLOW_UP) * wp.max(inner, before)
             bound = wp.min(bounds[0], bounds[1])
@@ -169,6 +174,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 status[1] = -1
                 alert[0] = wp.static(ALERT)
             else:
+                # what was dissipated is not to be gained again
+                dissipated = bound + work - total > scalar(0.5) * most and steps_to_audit[0] <= wp.static(EVERY - 4)
+                bounds[6] = wp.where(dissipated, inner, most * scalar(wp.static(1.0 - 1.0 / FORGET)))
                 bounds[0] += work
                 bounds[1] += work
                 bounds[3] = power[0]
@@ -176,8 +184,6 @@ def define(variant: Variant) -> SimpleNamespace:
                 bounds[5] = inner
                 alert[0] = wp.max(alert[0] - 1, 0)
                 steps_to_audit[0] = steps_to_audit[0] - 1
-                # what was dissipated is not to be gained again
-                dissipated = inner < scalar(0.1) * bounds[2]
                 audit_due[0] = wp.where(steps_to_audit[0] <= 0 or dissipated, 1, 0)
 
     return SimpleNamespace(

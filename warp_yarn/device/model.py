@@ -400,7 +400,7 @@ class Model:
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
         self.watches = not (self.held and self.scene.pin_path is not None)
-        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 6}
+        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 7}
         for name, count in counts.items():
             a[name] = a.zeros(count, a.variant.scalar)
         for name in ("steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
@@ -418,13 +418,13 @@ class Model:
         """Begins to watch anew, from the present state on."""
         for name, value in (("audit_due", 1), ("alert", 0)):
             self.arrays.put(name, value)
-        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0)
+        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0, 0.0)
 
     def trust_energy(self) -> None:
         """Lets all steps pass, until ``forget_energy``: steps that are made again, from the middle of a run, were
         watched the first time."""
         a = self.arrays
-        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0, 0.0)
+        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)
         a.put("audit_due", 0)
         a.put("steps_to_audit", np.iinfo(np.int32).max)
 
@@ -491,9 +491,7 @@ class Model:
         self._add_energies(cheap=True)
         self.launch("suspect", 1)
         wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
-        keeps = bool(self._outer) and not by_stages
-        if not by_stages:
-            self._add_powers()
+        self._add_powers()
         self.launch("close_step", 1, by_stages=int(by_stages))
-        if keeps:
+        if self._outer:
             self.launch("keep_outer_force", "nodes", force=a["q_x"])

@@ -17,6 +17,8 @@ MOVED = (*STATE, "increment", "euler_increment")
 INNER_TOLERANCE = 1e-2
 """Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
 would not come nearer to the stage's."""
+INNER_TOLERANCE_FREE = 1e-3
+"""The same of a cloth that nothing holds: what is left of its momentum adds up from step to step."""
 MOST_PARTS = 100
 """Of GMRES, each kept as a vector."""
 
@@ -73,7 +75,7 @@ class StageMethod:
             ("unit", 1.0),
             ("step_length", 1.0),
             ("shortest", 1e30),
-            ("inner_tolerance", INNER_TOLERANCE),
+            ("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE),
         ):
             a.setdefault(name, a.numbers(value))
         self.set_times(model.step_size, model.step_size)
@@ -230,6 +232,8 @@ class StageMethod:
         """δ, from A δ = r."""
         a = self.model.arrays
         a.zero("direction", "euler_direction")
+        if not len(self.model.scene.pins):
+            self.model.launch("start_rigid", 1)
         self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
         self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
         self.model.launch("search", 1)

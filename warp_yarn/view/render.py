@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 import os
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -235,8 +236,17 @@ def _extra(module: str) -> Any:
         raise InputError(f"{name} is not installed, which pictures need: pip install warp_yarn[render]") from error
 
 
+_LOADING = threading.Lock()
+"""Two threads that import PyVista at once each see half of it."""
+
+
 def _pyvista() -> Any:
     """PyVista, where VTK can draw; where it cannot, VTK would end the process by a segmentation fault."""
+    with _LOADING:
+        return _loaded_pyvista()
+
+
+def _loaded_pyvista() -> Any:
     pv = _extra("pyvista")
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         # By itself VTK tries X11 first, and crashes where that is not installed.
