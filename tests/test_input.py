@@ -230,3 +230,8 @@ def test_a_kernel_cache_that_cannot_be_written_is_named(tmp_path, when) -> None:
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.count("WARP_CACHE_PATH") == 2
+
+
+def test_true_is_no_number():
+    with pytest.raises(wy.InputError, match="density = True, must be a number"):
+        wy.Yarn(density=True, stretch=1.0, bend=1.0)

@@ -2,6 +2,8 @@
 
 import asyncio
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 
@@ -183,3 +185,25 @@ def test_more_threads_than_cores_warn():
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     with pytest.warns(RuntimeWarning, match=rf"threads = {cores + 1}, but there are {cores} processor cores"):
         wy.Simulator(scene(), threads=cores + 1)
+
+
+def test_threads_that_draw_at_once(tmp_path):
+    """In a process of its own, where nothing has loaded what draws."""
+    code = (
+        "import sys, threading, warp_yarn as wy\n"
+        "trajectory = wy.Simulator(wy.Scene(wy.paper.cloth(rows=3, columns=3))).run(0)\n"
+        "failed = []\n"
+        "def draw(k):\n"
+        "    try: wy.write_png(f'{sys.argv[1]}/{k}.png', trajectory, size=(64, 48))\n"
+        "    except BaseException as error: failed.append(error)\n"
+        "threads = [threading.Thread(target=draw, args=(k,)) for k in range(4)]\n"
+        "for thread in threads: thread.start()\n"
+        "for thread in threads: thread.join()\n"
+        "sys.exit(str(failed) if failed else 0)\n"
+    )
+    pytest.importorskip("pyvista")
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
+    if "no OpenGL" in done.stderr:
+        pytest.skip("this machine cannot draw")
+    assert done.returncode == 0, done.stderr
+    assert len(list(tmp_path.glob("*.png"))) == 4

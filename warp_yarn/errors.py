@@ -81,8 +81,8 @@ def number(name: str, value: Any, *, above: float | None = None, least: float | 
     if least is not None:
         allowed = f"finite and at least {least:g}"
     try:
-        if isinstance(value, str | bytes):
-            raise TypeError("text")
+        if isinstance(value, str | bytes | bool):
+            raise TypeError("text, or true or false")
         result = float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} = {value!r}, must be a number, {allowed}") from error

@@ -243,7 +243,10 @@ _LOADING = threading.Lock()
 def _pyvista() -> Any:
     """PyVista, where VTK can draw; where it cannot, VTK would end the process by a segmentation fault."""
     with _LOADING:
-        return _loaded_pyvista()
+        pv = _loaded_pyvista()
+        # it imports what draws when that is first asked for
+        _ = pv.Plotter, pv.PolyData, pv.Light
+        return pv
 
 
 def _loaded_pyvista() -> Any:
