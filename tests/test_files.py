@@ -1,5 +1,6 @@
 """Files that appear whole or not at all: links, folders that cannot be written, and processes that are ended."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -92,3 +93,9 @@ def test_others_plans_for_sigterm_are_kept(tmp_path):
     finally:
         signal.signal(signal.SIGTERM, before)
     assert (tmp_path / "a.txt").read_text() == "again"
+
+
+def test_what_a_write_raises_names_the_file(tmp_path):
+    with pytest.raises(OSError, match=r"File too large: .*a\.npz"), files.whole_file(tmp_path / "a.npz"):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    assert os.listdir(tmp_path) == []

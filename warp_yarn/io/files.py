@@ -30,6 +30,11 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
             temporary = Path(folder) / target.name
             yield temporary
             os.replace(temporary, target)
+        except OSError as error:
+            if error.errno is None or error.filename is not None:
+                raise
+            # what a write raises does not know its file
+            raise OSError(error.errno, error.strerror, str(path)) from error
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
