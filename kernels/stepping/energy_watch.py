@@ -166,9 +166,11 @@ def define(variant: Variant) -> SimpleNamespace:
                 room += scalar(BLOW_UP) * wp.max(inner, before)
             bound = wp.min(bounds[0], bounds[1])
             if damps[0] != 0:
-                # there is no surer method: it only may not blow up
+                # there is no surer method: what there was at the start counts, and a part that cannot be halved again
+                # may only not blow up
                 bound = bounds[1]
-                room += scalar(BLOW_UP) * wp.max(inner, before)
+                if damps[0] > 1:
+                    room += scalar(BLOW_UP) * wp.max(inner, before)
             if not (total <= bound + work + room):
                 status[0] = wp.static(GAINED)
                 status[1] = -1

@@ -77,7 +77,7 @@ class Parts:
             if not accepted and self._is_to_damp(gained, least):
                 gained = False
                 self._restore()
-                accepted = self._damp(count, size, left)
+                accepted = self._damp(count, size, left, last=0.5 * size < least)
             if not accepted:
                 self.rejected += 1
                 if self.size < least:
@@ -105,12 +105,12 @@ class Parts:
             return False
         return gained or self._status() == GAINED or self.size < least
 
-    def _damp(self, count: Callable[[], None], size: float, left: float) -> bool:
-        """Makes a part by the fallback; whether it is good."""
+    def _damp(self, count: Callable[[], None], size: float, left: float, *, last: bool) -> bool:
+        """Makes a part by the fallback; whether it is good. The last resort, which cannot be halved, may gain more."""
         if self._fallback is None:
             with ALONE:
                 self._fallback = self._make_fallback()
-        self.model.arrays.put("damps", 1)
+        self.model.arrays.put("damps", 2 if last else 1)
         accepted = self._try(self._fallback, count, size, left)
         self.model.arrays.put("damps", 0)
         self.damped += accepted
