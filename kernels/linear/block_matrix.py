@@ -24,7 +24,7 @@ from ..core import memory
 from ..core.status import NOT_CONVERGED, NOT_FINITE
 from ..core.variant import Variant
 
-_GATHER = """
+UPPER = """
     row a = {}, b = {}, c = {}, x_s = {}, u_x = {}, v_x = {};
     SCALAR u_s = 0, v_s = 0;
     auto add = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
@@ -47,6 +47,11 @@ _GATHER = """
         }
 #endif
     };
+"""
+"""C++ that adds up row i of U (x, s), slot by slot."""
+_GATHER = (
+    UPPER
+    + """
     for (int slot = stencil - 1; slot >= 0; --slot) {
         add(slot, 1, v_x, v_s);
 #if SLIDING
@@ -65,6 +70,7 @@ _GATHER = """
 #endif
     return y;
 """
+)
 _SPREAD = """
     auto take = [&](int slot, int direction, SCALAR along) {
         const int j = neighbour.data[stencil * i + slot];

@@ -19,7 +19,7 @@ import warp as wp
 
 from ..core import memory
 from ..core.variant import Variant
-from . import block_matrix, lines
+from . import block_matrix, incomplete_cholesky, lines
 from . import threads as teams
 from .lines import BLOCKS
 from .threads import call, meet, share, wait_for_call
@@ -27,50 +27,30 @@ from .threads import call, meet, share, wait_for_call
 SAFE = {wp.float64: 1e-12, wp.float32: 1e-5}
 """Part of a diagonal entry of the coarsest level that its pivot must keep; what does not is left to the lines."""
 
-_ROW = """
-    row a = {}, b = {}, c = {}, y = {}, u_x = {}, v_x = {};
-    SCALAR u_s = 0, v_s = 0;
-    auto add_upper = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
-        const int j = neighbour.data[stencil * i + slot];
-        if (j < 0)
-            return;
-        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
-        const SCALAR* of = x.data[j].c;
-        const row its = {of[0], of[1], of[2], 0};
-        a = a + *(const row*)m * its;
-        b = b + *(const row*)(m + 3) * its;
-        c = c + *(const row*)(m + 6) * its;
-#if SLIDING
-        if (slot < 4) {
-            const int k = 4 * i + slot;
-            const SCALAR along = s.data[2 * j + direction];
-            y = y + *(const row*)upper_xs.data[k].c * along;
-            s_x = s_x + *(const row*)upper_sx.data[k].c * its;
-            s_s += upper_ss.data[k] * along;
-        }
-#endif
-    };
+_ROW = (
+    block_matrix.UPPER
+    + """
     auto add_lower = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
         const int j = lower.data[stencil * i + slot];
         if (j < 0)
             return;
         const SCALAR* m = upper_xx.data[stencil * j + slot].data[0];
         const SCALAR* of = x.data[j].c;
-        y = y + *(const row*)m * of[0] + *(const row*)(m + 3) * of[1] + *(const row*)(m + 6) * of[2];
+        x_s = x_s + *(const row*)m * of[0] + *(const row*)(m + 3) * of[1] + *(const row*)(m + 6) * of[2];
 #if SLIDING
         if (slot < 4) {
             const int k = 4 * j + slot;
             const SCALAR along = s.data[2 * j + direction];
             const row its = {of[0], of[1], of[2], 0};
-            y = y + *(const row*)upper_sx.data[k].c * along;
+            x_s = x_s + *(const row*)upper_sx.data[k].c * along;
             s_x = s_x + *(const row*)upper_xs.data[k].c * its;
             s_s += upper_ss.data[k] * along;
         }
 #endif
     };
     for (int slot = 0; slot < stencil; slot += 2) {
-        add_upper(slot, 0, u_x, u_s);
-        add_upper(slot + 1, 1, v_x, v_s);
+        add(slot, 0, u_x, u_s);
+        add(slot + 1, 1, v_x, v_s);
         add_lower(slot, 0, u_x, u_s);
         add_lower(slot + 1, 1, v_x, v_s);
     }
@@ -86,15 +66,15 @@ _ROW = """
     const SCALAR* xs_u = diagonal_xs.data[2 * i].c;
     const SCALAR* xs_v = diagonal_xs.data[2 * i + 1].c;
     for (int k = 0; k < 3; ++k)
-        y[k] += xs_u[k] * u + xs_v[k] * v;
+        x_s[k] += xs_u[k] * u + xs_v[k] * v;
     const SCALAR y_u = u_x[0] + u_x[1] + u_x[2] + u_s + xs_u[0] * of[0] + xs_u[1] * of[1] + xs_u[2] * of[2]
         + diagonal_ss.data[2 * i] * u;
     const SCALAR y_v = v_x[0] + v_x[1] + v_x[2] + v_s + xs_v[0] * of[0] + xs_v[1] * of[1] + xs_v[2] * of[2]
         + diagonal_ss.data[2 * i + 1] * v;
 #endif
-    const SCALAR y_0 = a[0] + a[1] + a[2] + y[0];
-    const SCALAR y_1 = b[0] + b[1] + b[2] + y[1];
-    const SCALAR y_2 = c[0] + c[1] + c[2] + y[2];
+    const SCALAR y_0 = a[0] + a[1] + a[2] + x_s[0];
+    const SCALAR y_1 = b[0] + b[1] + b[2] + x_s[1];
+    const SCALAR y_2 = c[0] + c[1] + c[2] + x_s[2];
     q_x.data[i].c[0] = y_0;
     q_x.data[i].c[1] = y_1;
     q_x.data[i].c[2] = y_2;
@@ -106,6 +86,7 @@ _ROW = """
 #endif
     return energy;
 """
+)
 
 
 @functools.cache
@@ -154,11 +135,10 @@ def structs(variant: Variant) -> SimpleNamespace:
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, mat33, sym33, sliding = (
-        variant.scalar, variant.vec3, variant.mat33, variant.sym33, variant.sliding,
-    )  # fmt: skip
+    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     at, put = memory.functions(variant).at, memory.functions(variant).put
     report = block_matrix.functions(variant).report
+    product = incomplete_cholesky.functions(variant).product
     total = teams.functions(variant).total
     line = lines.functions(variant)
     factorize_nodes, factorize_coarse = line.factorize_nodes, line.factorize_coarse
@@ -296,15 +276,6 @@ def define(variant: Variant) -> SimpleNamespace:
             levels.coarse_z[node][i % 3] = value * at(levels.coarsest, size * i + i)
 
     @wp.func
-    def half(m: sym33, x: vec3) -> vec3:
-        """−m x."""
-        return -vec3(
-            m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
-            m[1] * x[0] + m[3] * x[1] + m[4] * x[2],
-            m[2] * x[0] + m[4] * x[1] + m[5] * x[2],
-        )
-
-    @wp.func
     def restrict(levels: Levels, below: wp.array(dtype=vec3), begin: int, end: int):
         """r of coarse nodes from the level below, and the start of their z."""
         for i in range(begin, end):
@@ -312,7 +283,7 @@ def define(variant: Variant) -> SimpleNamespace:
             for k in range(at(levels.child_start, i), at(levels.child_start, i + 1)):
                 r += at(below, at(levels.child, k)) * at(levels.child_weight, k)
             put(levels.coarse_r, i, r)
-            put(levels.coarse_z, i, half(at(levels.coarse_halves, i), r))
+            put(levels.coarse_z, i, -product(at(levels.coarse_halves, i), r))
 
     @wp.func
     def interpolated(levels: Levels, i: int) -> vec3:
@@ -464,7 +435,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 r = at(rhs, i) - at(q_x, i)
                 put(r_x, i, r)
                 put(p_x, i, vec3())
-                put(t_x, i, half(at(levels.halves, i), r))
+                put(t_x, i, -product(at(levels.halves, i), r))
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
                         put(r_s, s, at(euler_rhs, s) - at(q_s, s))
@@ -501,7 +472,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     put(solution, i, at(solution, i) + at(p_x, i) * alpha)
                     r = at(r_x, i) - at(q_x, i) * alpha
                     put(r_x, i, r)
-                    put(t_x, i, half(at(levels.halves, i), r))
+                    put(t_x, i, -product(at(levels.halves, i), r))
                     if wp.static(sliding):
                         for s in range(2 * i, 2 * i + 2):
                             put(euler_solution, s, at(euler_solution, s) + at(p_s, s) * alpha)

@@ -30,11 +30,11 @@ class StageMethod:
     q + t w₁ and q̇ + t (w₁ − q̇)/η: there a second stage starts, or the step ends if there is none. Where carried is 0
     the stage itself ends the step, and so does a second stage.
 
-    Newton's iteration ends where ‖r‖ ≤ newton_tolerance · ‖w‖, in the norms of ``judge``, or with a step that gets
-    there by what the time step's other iterations left of their residuals: evaluating that one's would only confirm it.
-    Along δ it takes a full step unless that overshoots: r·δ is minus the slope of the energy that a stage minimizes,
-    where there is one, and must not turn to more than 0.9 of itself with the other sign, or else ‖r‖ must fall. (That
-    it always falls is too much to ask of yarns that buckle.) Nor may crossings change their order.
+    Newton's iteration ends with the step that leaves less than newton_tolerance of the change of velocity, by what the
+    steps before it left: looking at where it led would only confirm it (``decide`` in ``kernels/nonlinear/newton.py``,
+    ``docs/solver.md``). Along δ it takes a full step unless that overshoots: r·δ is minus the slope of the energy that
+    a stage minimizes, where there is one, and must not turn to more than 0.9 of itself with the other sign, or else ‖r‖
+    must fall. (That it always falls is too much to ask of yarns that buckle.) Nor may crossings change their order.
     """
 
     name: str
