@@ -34,7 +34,7 @@ from common import RESULTS, environment, one_core, print_table, write_csv
 from ground_truth import Fabric
 
 import warp_yarn as wy
-from warp_yarn.calibration.learn import PAPER, Task, learn, value_of
+from warp_yarn.calibration.learn import PAPER, CalibrationProblem, learn, value_of
 
 FABRIC = Fabric("plain", (1, 2))
 WITHIN = 0.01
@@ -45,7 +45,7 @@ class Enough(Exception):
     """A method has had its runs."""
 
 
-class Record(Task):
+class Record(CalibrationProblem):
     """A task that notes how near to the truth it was asked to look, and when; it allows so many runs."""
 
     def begin(self, runs: int) -> Record:
@@ -77,7 +77,7 @@ class Record(Task):
         return result
 
 
-def least_squares(task: Task, rate: float | None) -> None:
+def least_squares(task: CalibrationProblem, rate: float | None) -> None:
     width = task.high - task.low
     scipy.optimize.least_squares(
         lambda y: 1e6 * task.residuals(task.low + width * y),  # in µm, so that no tolerance ends it early
@@ -88,7 +88,7 @@ def least_squares(task: Task, rate: float | None) -> None:
     )
 
 
-def lbfgsb(task: Task, rate: float | None) -> None:
+def lbfgsb(task: CalibrationProblem, rate: float | None) -> None:
     width = task.high - task.low
     first = task.loss(task.start)
 
@@ -100,10 +100,10 @@ def lbfgsb(task: Task, rate: float | None) -> None:
     scipy.optimize.minimize(of, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 0.0, "gtol": 0.0})
 
 
-def sigmoid_descent(optimizer: Callable[..., torch.optim.Optimizer]) -> Callable[[Task, float], None]:
+def sigmoid_descent(optimizer: Callable[..., torch.optim.Optimizer]) -> Callable[[CalibrationProblem, float], None]:
     """Descent of y by one of torch's optimizers, with value = a·sigmoid(y) + b, of the loss relative to its first."""
 
-    def descend(task: Task, rate: float) -> None:
+    def descend(task: CalibrationProblem, rate: float) -> None:
         low, width = (torch.tensor(of) for of in (task.low, task.high - task.low))
         y = torch.logit((torch.tensor(task.start) - low) / width).requires_grad_()
         descent = optimizer([y], lr=rate)
@@ -118,7 +118,7 @@ def sigmoid_descent(optimizer: Callable[..., torch.optim.Optimizer]) -> Callable
     return descend
 
 
-METHODS: dict[str, Callable[[Task, float | None], Any]] = {
+METHODS: dict[str, Callable[[CalibrationProblem, float | None], Any]] = {
     "ours": lambda task, rate: learn(task),
     "least_squares": least_squares,
     "L-BFGS-B": lbfgsb,

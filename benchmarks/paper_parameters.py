@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator
 from plots import COLORS, save
 
 import warp_yarn as wy
-from warp_yarn.calibration.learn import Result, Task, learn, value_of
+from warp_yarn.calibration.learn import CalibrationProblem, Result, learn, value_of
 from warp_yarn.integrators import INTEGRATORS
 
 OF_YARNS = 6
@@ -62,7 +62,7 @@ def learned(
     """Learns a fabric from so many frames, and puts what the paper found of the first of NAMES beside ours."""
     about = case(fabric, kind, size, frames)
     target = fabric.truth(size, frames, kind, **options)
-    result = learn(Task(fabric.model(size), target, PARAMETERS, **options), progress=True)
+    result = learn(CalibrationProblem(fabric.model(size), target, PARAMETERS, **options), progress=True)
     rows = []
     for row in parameter_rows(result, {name: fabric.value(name) for name in NAMES}):
         theirs = dict.fromkeys(("paper", "paper's error", "ratio"), "")
@@ -70,7 +70,7 @@ def learned(
             value = papers[len(rows)]
             error = value / row["true"] - 1.0
             theirs = {"paper": value, "paper's error": error, "ratio": ratio(error, row["error"])}
-        rows.append({**about, **row, "step [ms]": 1e3 * result.task.step, **theirs})
+        rows.append({**about, **row, "step [ms]": 1e3 * result.problem.step, **theirs})
     return rows
 
 
@@ -109,7 +109,7 @@ def bias(options: argparse.Namespace) -> Iterator[list[dict[str, Any]]]:
         about = {"data": data, "integrator": method, "order": INTEGRATORS[method].order, "step [ms]": 1e3 * step}
         try:
             what = {"frames": options.frames, "first": first, "step": step, "integrator": method}
-            task = Task(scene, target, PARAMETERS, **what, **TIGHT)
+            task = CalibrationProblem(scene, target, PARAMETERS, **what, **TIGHT)
             result = learn(task, halvings=0, progress=True)
         except wy.SimulationError as error:
             print(f"{method} cannot start with this step: {error}")

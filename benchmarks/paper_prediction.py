@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from plots import COLORS, MARKERS, save
 
 import warp_yarn as wy
-from warp_yarn.calibration.learn import Task, learn, with_values
+from warp_yarn.calibration.learn import CalibrationProblem, learn, with_values
 from warp_yarn.presets import paper
 
 METHODS = ("ours", "BO", "sheet")
@@ -85,12 +85,12 @@ def methods(fabric: Fabric, size: int, target: wy.Trajectory, runs: int, **optio
         runs: simulations that the baselines may use.
     """
     model, positions = fabric.model(size), target.position[1:]
-    result = learn(Task(model, target, PARAMETERS, **options), progress=True)
-    ours = of_yarns(fabric, result.values, result.task.steps_per_frame, **options)
+    result = learn(CalibrationProblem(model, target, PARAMETERS, **options), progress=True)
+    ours = of_yarns(fabric, result.values, result.problem.steps_per_frame, **options)
     found = {"ours": Learned(result.simulations + result.gradients, result.seconds, ours)}
 
     begin = time.perf_counter()
-    task = Task(model, target, PARAMETERS, **options)
+    task = CalibrationProblem(model, target, PARAMETERS, **options)
     still = mean_square(positions, target.position[0])
     best = bayesian.minimize(task.loss, task.low, task.high, runs, failed=still)
     values = dict(zip(NAMES, best.tolist(), strict=True))

@@ -27,7 +27,7 @@ import warp as wp
 from common import RESULTS, environment, one_core, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn.calibration.learn import Parameter, Task, learn, value_of
+from warp_yarn.calibration.learn import CalibrationProblem, Parameter, learn, value_of
 from warp_yarn.presets import paper
 
 FABRICS = ("paper", "handkerchief")
@@ -76,7 +76,7 @@ def scores(fabric: str, pose: str, truth: str, size: int, seeds: Sequence[int]) 
         noise = np.random.default_rng(seed).normal(size=clean.position.shape)
         noise[0] = 0.0  # the model starts there
         noisy = dataclasses.replace(clean, position=clean.position + NOISE * noise)
-        result = learn(Task(scene, noisy, parameters, every=every, **SOLVED))
+        result = learn(CalibrationProblem(scene, noisy, parameters, every=every, **SOLVED))
         of = [(result.values[p.name] - value_of(scene, p.name)) / result.uncertainty[p.name] for p in parameters]
         z.append(of)
         uncertainty.append([result.uncertainty[p.name] / (p.high - p.low) for p in parameters])

@@ -32,7 +32,7 @@ from matplotlib.figure import Figure
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 import warp_yarn as wy
-from warp_yarn.calibration.learn import PAPER, Parameter, Result, Task, learn, learnable, split, value_of
+from warp_yarn.calibration.learn import PAPER, CalibrationProblem, Parameter, Result, learn, learnable, split, value_of
 from warp_yarn.errors import whole
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.io.files import whole_file
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     make_folders([options.output, options.plot, options.result])
     scene, target = read(options)
     method = {} if options.integrator is None else {"integrator": options.integrator}
-    task = Task(
+    task = CalibrationProblem(
         scene,
         target,
         chosen(scene, options),
@@ -119,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         if checkpoint.exists():
             print(f"\nThe same command with --resume goes on from {checkpoint}.", file=sys.stderr)
         raise
-    task = result.task  # its step may be shorter now
+    task = result.problem  # its step may be shorter now
     numbers = summary(task, result, options.file)
     with whole_file(options.result) as temporary:
         temporary.write_text(json.dumps(numbers, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -177,7 +177,7 @@ def chosen(scene: wy.Scene, options: argparse.Namespace) -> list[Parameter]:
 # -- what is written --------------------------------------------------------------------------------------------------
 
 
-def summary(task: Task, result: Result, file: Path) -> dict[str, Any]:
+def summary(task: CalibrationProblem, result: Result, file: Path) -> dict[str, Any]:
     """What was learned, for the JSON file."""
     weave = task.scene.cloth.weave
     return {
@@ -215,7 +215,7 @@ def summary(task: Task, result: Result, file: Path) -> dict[str, Any]:
     }
 
 
-def plot(path: Path, task: Task, result: Result) -> None:
+def plot(path: Path, task: CalibrationProblem, result: Result) -> None:
     """The loss and the path of every parameter through its range, by iteration."""
     panels = 1 + len(result.parameters)
     columns = min(3, panels)
@@ -252,7 +252,9 @@ def plot(path: Path, task: Task, result: Result) -> None:
         figure.savefig(temporary, dpi=150)
 
 
-def animate(path: Path, task: Task, result: Result, target: wy.Trajectory, options: argparse.Namespace) -> None:
+def animate(
+    path: Path, task: CalibrationProblem, result: Result, target: wy.Trajectory, options: argparse.Namespace
+) -> None:
     """Data and model side by side, to the end of the data: /comparison/data and, at its right, /comparison/model."""
     data = thinned(target, options.first, options.every, task.frame_time)
     values = np.array(list(result.values.values()))
@@ -302,7 +304,7 @@ def _write_side_by_side(folder: Path, path: Path, trajectories: dict[str, wy.Tra
     stage.Save()
 
 
-def tell(task: Task, result: Result) -> None:
+def tell(task: CalibrationProblem, result: Result) -> None:
     """A table of what was learned, and a few lines about how well."""
     print(f"{'':14}{'value':>12}{'± uncertainty':>16}{'without step error':>20}{'in the file':>14}")
     for p in result.parameters:

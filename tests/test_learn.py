@@ -4,6 +4,7 @@ import concurrent.futures
 import copy
 import csv
 import dataclasses
+import importlib
 import json
 import multiprocessing
 import pickle
@@ -17,8 +18,11 @@ from pxr import Usd, UsdGeom
 from scripts import exit_code, load, samples
 
 import warp_yarn as wy
-from warp_yarn.calibration import learn as wl
-from warp_yarn.calibration.learn import PAPER, Parameter, Task, learn, value_of, with_values
+from warp_yarn.calibration import differences
+from warp_yarn.calibration.learn import PAPER, CalibrationProblem, Parameter, learn, value_of, with_values
+from warp_yarn.calibration.parameters import learnable
+from warp_yarn.calibration.problem import with_paths
+from warp_yarn.calibration.uncertainty import independent, residual_variance, uncertainties
 from warp_yarn.io.published import DATASETS, PROPERTIES
 from warp_yarn.simulation.state import FIELDS
 
@@ -46,7 +50,7 @@ def data():
 
 
 def task(target, parameters=(DENSITY, BEND, SHEAR), scene=SCENE, **options):
-    return Task(scene, target, parameters, **{"integrator": "linear", **options})
+    return CalibrationProblem(scene, target, parameters, **{"integrator": "linear", **options})
 
 
 def truth(of):
@@ -58,9 +62,7 @@ def truth(of):
 
 def test_every_value_that_can_be_learned_is_read_and_replaced():
     names = [
-        name if count is None else f"{name}[{k}]"
-        for name, count in wl.learnable(SCENE).items()
-        for k in range(count or 1)
+        name if count is None else f"{name}[{k}]" for name, count in learnable(SCENE).items() for k in range(count or 1)
     ]
     assert {"density[1]", "friction_damping", "wind_velocity[2]", "gravity[0]", "pin_stiffness"} <= set(names)
     before = {name: value_of(SCENE, name) for name in names}
@@ -115,6 +117,20 @@ def test_refused(case):
     call, message = REFUSED[case]
     with pytest.raises(wy.InputError, match=message):
         call()
+
+
+def test_names_of_before_work_and_say_so(data):
+    """Of the module, by both of its names, and of what came of it, which was pickled by them too."""
+    import warp_yarn.learn
+
+    for module in (warp_yarn.learn, importlib.import_module("warp_yarn.calibration.learn")):
+        with pytest.warns(DeprecationWarning, match="learn.Task is CalibrationProblem now"):
+            assert module.Task is CalibrationProblem
+        with pytest.raises(AttributeError, match="no attribute 'Tusk'"):
+            _ = module.Tusk
+    result = learn(task(data, [SHEAR]), iterations=0)
+    with pytest.warns(DeprecationWarning, match=r"Result\.task is Result\.problem now"):
+        assert result.task is result.problem
 
 
 # -- the problem ------------------------------------------------------------------------------------------------------
@@ -227,7 +243,7 @@ def test_the_same_paths_in_other_steps_leave_the_steps_error_alone(stiffness):
     scene, options = moved(stiffness), {"integrator": "sdirk2"}
     # what the scene means: pins that move linearly, forces of a row each
     start = scene.cloth.position[scene.pins]
-    fine = motion(wl.with_paths(scene, start, 0, Fraction(1, 32), 24 * 32), 24 * 32, 1e-3 / 32, **options)
+    fine = motion(with_paths(scene, start, 0, Fraction(1, 32), 24 * 32), 24 * 32, 1e-3 / 32, **options)
     data = dataclasses.replace(fine, step=1e-3, **{name: getattr(fine, name)[::32] for name in FIELDS})
     moves = np.linalg.norm(data.position[9:] - data.position[8], axis=2)
 
@@ -252,7 +268,7 @@ def test_paths_in_steps_of_another_length():
     force = scene.force_path[:, 0]
 
     def of(first, ratio, steps):
-        result = wl.with_paths(scene, start, first, Fraction(ratio), steps)
+        result = with_paths(scene, start, first, Fraction(ratio), steps)
         return result.pin_path, result.force_path[:, 0]
 
     pins, forces = of(0, "1/2", 14)
@@ -266,7 +282,7 @@ def test_paths_in_steps_of_another_length():
     expected = [2.0 * force[2] + force[3], force[3] + 2.0 * force[4], 2.0 * force[5]]
     np.testing.assert_allclose(forces[:3], np.array(expected) / 3.0, atol=1e-18)
     # the other node's force never ends, and the scene is what it was
-    assert (wl.with_paths(scene, start, 2, Fraction(1, 3), 60).force_path[:, 1] == [1e-5, 0.0, 0.0]).all()
+    assert (with_paths(scene, start, 2, Fraction(1, 3), 60).force_path[:, 1] == [1e-5, 0.0, 0.0]).all()
     assert scene.pin_path is path and len(scene.force_path) == 7
 
 
@@ -275,7 +291,7 @@ def test_shear_is_learned_from_the_middle_of_a_motion_with_paths():
     problem = task(motion(scene, 24), [SHEAR], scene, first=8)
     result = learn(problem)
     assert result.values["shear"] == pytest.approx(1000.0, rel=1e-3)
-    assert result.task is problem and result.step_share < 1e-3
+    assert result.problem is problem and result.step_share < 1e-3
 
 
 def test_tasks_and_results_go_to_another_process_and_back(data):
@@ -287,7 +303,7 @@ def test_tasks_and_results_go_to_another_process_and_back(data):
     with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
         there = pool.submit(learn, problem).result()
         assert there.values == here.values and there.uncertainty == here.uncertainty
-        assert there.task.loss(problem.start) == problem.loss(problem.start)
+        assert there.problem.loss(problem.start) == problem.loss(problem.start)
         # a model too stiff for its step
         broken = task(data, [Parameter("bend[0]", 1.0, 1e12, 1e12)], max_iterations=1)
         with pytest.raises(wy.SimulationError) as caught:
@@ -301,7 +317,7 @@ def test_tasks_and_results_go_to_another_process_and_back(data):
 def test_what_ends_learning_has_what_was_learned(data, tmp_path, monkeypatch, error):
     """The iterations until then, and a checkpoint to go on from."""
     uninterrupted = learn(task(data))
-    real, path = Task.residuals, tmp_path / "checkpoint.npz"
+    real, path = CalibrationProblem.residuals, tmp_path / "checkpoint.npz"
     runs = []
 
     def counted(self, values):
@@ -309,7 +325,7 @@ def test_what_ends_learning_has_what_was_learned(data, tmp_path, monkeypatch, er
         return real(self, values)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Task, "residuals", counted)
+        patch.setattr(CalibrationProblem, "residuals", counted)
         learn(task(data))
     # the first run, in the first Jacobian, before and after a step, in the last Jacobian
     for stop in [runs[k] + 1 for k in (0, 1, 3, 5, 6, -1)]:
@@ -322,7 +338,7 @@ def test_what_ends_learning_has_what_was_learned(data, tmp_path, monkeypatch, er
 
         path.unlink(missing_ok=True)
         with monkeypatch.context() as patch, pytest.raises(error) as caught:
-            patch.setattr(Task, "residuals", residuals)
+            patch.setattr(CalibrationProblem, "residuals", residuals)
             learn(problem, checkpoint=path)
         done = caught.value.iterations
         before = [i for i in uninterrupted.history if i.simulations < stop]
@@ -371,7 +387,7 @@ def test_a_minimum_inside_the_ranges_has_no_gradient(data):
     result = learn(problem)
     assert result.ended == "converged"
     first = problem.loss_and_gradient(problem.start)[1] * (problem.high - problem.low)
-    # ENOUGH of a standard deviation is some 1e-5 of a range
+    # CONVERGED_STEP of a standard deviation is some 1e-5 of a range
     assert np.abs(result.gradient).max() < 1e-3 * np.abs(first).max()
 
 
@@ -451,7 +467,7 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_ends(tmp_path, after, tim
     with pytest.raises(KeyboardInterrupt):
         of(checkpoint=path, watch=interrupt)
     resumed = of(checkpoint=path)
-    assert resumed.task.step == whole.task.step
+    assert resumed.problem.step == whole.problem.step
     for name in ("values", "uncertainty", "step_error", "status", "loss", "simulations", "gradients", "ended"):
         assert getattr(resumed, name) == getattr(whole, name)
     np.testing.assert_array_equal(resumed.correlation, whole.correlation)
@@ -473,7 +489,7 @@ def test_a_checkpoint_of_something_else_is_refused(data, tmp_path):
         learn(task(data, [DENSITY, BEND, dataclasses.replace(SHEAR, high=1300.0)]), checkpoint=path)
     with pytest.raises(wy.InputError, match=r"of other parameters, .*resolution"):
         learn(task(data), checkpoint=path, resolution=1e-8)
-    with pytest.raises(wy.InputError, match=r"checkpoint\.npz: of another task: it has a loss of"):
+    with pytest.raises(wy.InputError, match=r"checkpoint\.npz: of another problem: it has a loss of"):
         learn(task(data, frames=FRAMES - 1), checkpoint=path)
     assert path.read_bytes() == kept
     path.write_bytes(kept[: len(kept) // 2])
@@ -488,7 +504,7 @@ def test_what_the_data_do_not_see_keeps_the_variance_of_its_range():
     rng = np.random.default_rng(2)
     seen = rng.normal(size=200)
     jacobian = np.stack([seen, np.zeros(200), seen, rng.normal(size=200)], axis=1)
-    covariance = wl.uncertainties(jacobian, 1e-4)
+    covariance = uncertainties(jacobian, 1e-4)
     deviation = np.sqrt(np.diag(covariance))
     # 0 and 2 cannot be told apart: their sum is known, their difference is what it was.
     assert deviation[1] == pytest.approx(1.0 / np.sqrt(12.0), rel=1e-12)
@@ -502,21 +518,21 @@ def test_noise_counts_as_many_residuals_and_a_smooth_misfit_as_few():
     rng = np.random.default_rng(3)
     noise = rng.normal(size=(40, 30, 30, 3))
     # a correlation of neighbours is known to 1/√108 000
-    assert wl.independent(noise) == pytest.approx(noise.size, rel=0.02)
-    assert wl.independent(np.ones((10, 5, 5, 3))) == 3.0
-    assert wl.independent(np.zeros((10, 5, 5, 3))) == 750.0
+    assert independent(noise) == pytest.approx(noise.size, rel=0.02)
+    assert independent(np.ones((10, 5, 5, 3))) == 3.0
+    assert independent(np.zeros((10, 5, 5, 3))) == 750.0
     smooth = noise.copy()
     for k in range(1, 40):
         smooth[k] = 0.8 * smooth[k - 1] + 0.6 * noise[k]
     # n numbers with a correlation of ρ^|i − j| have a λ of nearly (1 + ρ)/(1 − ρ). Along the other axes noise looks
     # less like noise then, since samples are alike: that is the safe side, and not far on it.
     some = noise.size * 0.2 / 1.8
-    assert 0.5 * some < wl.independent(smooth) < 1.15 * some
-    assert wl.residual_variance(smooth, 8, 1e-9) == pytest.approx((smooth**2).sum() / wl.independent(smooth), rel=1e-3)
+    assert 0.5 * some < independent(smooth) < 1.15 * some
+    assert residual_variance(smooth, 8, 1e-9) == pytest.approx((smooth**2).sum() / independent(smooth), rel=1e-3)
     # Neighbours that differ are no more independent than those that are alike.
     alternating = smooth * (-1.0) ** np.arange(40)[:, None, None, None]
-    assert wl.independent(alternating) == pytest.approx(wl.independent(smooth))
-    assert wl.residual_variance(1e-12 * smooth, 8, 1e-3) == 1e-6
+    assert independent(alternating) == pytest.approx(independent(smooth))
+    assert residual_variance(1e-12 * smooth, 8, 1e-3) == 1e-6
 
 
 @pytest.mark.parametrize("times", [1, 8])
@@ -525,7 +541,7 @@ def test_the_steps_part_of_the_values_is_found_where_the_data_are_without_it(tim
     problem = task(target, [dataclasses.replace(DENSITY, high=4e-3)], every=times)
     result = learn(problem, halvings=0)
     error = result.values["density[0]"] - value_of(SCENE, "density[0]")
-    assert result.task is problem
+    assert result.problem is problem
     if times == 1:
         assert result.step_share < 1e-6 and abs(error) < 1e-6
         assert abs(result.step_error["density[0]"]) < 1e-3 * abs(error)
@@ -546,9 +562,9 @@ def test_the_step_is_halved_to_that_of_the_data_and_no_further():
         fine = motion(scene, frames=5 * times, step=1e-3 / times)
         problem = task(fine, parameters, scene=scene, every=times)
         result = learn(problem)
-        assert result.task.step == pytest.approx(1e-3 / times)
+        assert result.problem.step == pytest.approx(1e-3 / times)
         steps = [i.step for i in result.history]
-        assert steps[0] == problem.step == pytest.approx(1e-3) and steps[-1] == result.task.step
+        assert steps[0] == problem.step == pytest.approx(1e-3) and steps[-1] == result.problem.step
         assert np.diff([i.loss for i in result.history]).max() < 0.0
         # 1 nm, at which learning ends
         for name in problem.names:
@@ -559,7 +575,7 @@ def test_the_step_is_halved_to_that_of_the_data_and_no_further():
             assert before.simulations == 1 and after.simulations > result.history[1].simulations
             assert result.gradients == 4
     once = learn(task(fine, parameters, scene=scene, every=4), halvings=1)
-    assert once.task.step == pytest.approx(5e-4)
+    assert once.problem.step == pytest.approx(5e-4)
 
 
 @pytest.mark.slow
@@ -569,14 +585,14 @@ def test_noise_halves_no_step(data):
     for _ in range(4):
         noisy = dataclasses.replace(data, position=data.position + 1e-6 * rng.normal(size=data.position.shape))
         problem = task(noisy)
-        assert learn(problem).task is problem
+        assert learn(problem).problem is problem
 
 
 def test_a_gradient_that_fails_does_not_lose_what_was_learned(data, monkeypatch):
     def fail(self, values):
         raise wy.GradientError("in parts", step=1, term=None)
 
-    monkeypatch.setattr(Task, "loss_and_gradient", fail)
+    monkeypatch.setattr(CalibrationProblem, "loss_and_gradient", fail)
     result = learn(task(data, [SHEAR]))
     assert np.isnan(result.gradient).all() and result.values["shear"] == pytest.approx(1000.0, rel=1e-3)
 
@@ -585,7 +601,7 @@ def test_a_step_that_cannot_be_halved_leaves_its_part_unknown(data, monkeypatch)
     def fail(self, values, frames=None, *, refine=1):
         raise wy.SimulationError("too stiff", step=1, node=-1, term=None, trajectory=None)
 
-    monkeypatch.setattr(Task, "trajectory", fail)
+    monkeypatch.setattr(CalibrationProblem, "trajectory", fail)
     result = learn(task(data, [SHEAR]))
     assert (result.step_error["shear"], result.step_share) == (0.0, 0.0)
     assert result.values["shear"] == pytest.approx(1000.0, rel=1e-3)
@@ -631,18 +647,20 @@ def test_differences_are_taken_above_what_the_solver_leaves(monkeypatch):
     def apart(jacobian):
         return (np.linalg.norm(jacobian - exact, axis=0) / np.linalg.norm(exact, axis=0)).max()
 
-    exact = Task(scene, target, parameters)
+    exact = CalibrationProblem(scene, target, parameters)
     values = truth(exact)
     exact = exact.jacobian(values, exact.residuals(values))
     # three times what a plain difference makes of the parameter that does the least, another one in every run
-    random, run = np.random.default_rng(0), Task._run
-    noise = 3.0 * wl.DIFFERENCE * np.linalg.norm(exact, axis=0).min() / np.sqrt(len(exact))
+    random, run = np.random.default_rng(0), CalibrationProblem._run
+    noise = 3.0 * differences.WIDTH * np.linalg.norm(exact, axis=0).min() / np.sqrt(len(exact))
     monkeypatch.setattr(
-        Task, "_run", lambda *a: run(*a) + noise * torch.as_tensor(random.normal(size=target.position[1:].shape))
+        CalibrationProblem,
+        "_run",
+        lambda *a: run(*a) + noise * torch.as_tensor(random.normal(size=target.position[1:].shape)),
     )
-    loose = Task(scene, target, parameters)
+    loose = CalibrationProblem(scene, target, parameters)
     residuals = loose.residuals(values)
-    plain = [loose._difference(values, residuals, wl.DIFFERENCE, -row) for row in np.eye(4)]
+    plain = [differences.difference(loose, values, residuals, differences.WIDTH, -row) for row in np.eye(4)]
     assert apart(-np.stack(plain, axis=1)) > 1.0  # noise, and no sign of it
     # two that agree to a quarter
     assert apart(loose.jacobian(values, residuals)) < 0.3
@@ -715,7 +733,7 @@ def test_a_model_that_fails_later_is_written_as_far_as_it_goes(recording, tmp_pa
         made = motion(self.scene, 9, step=self.step)
         raise wy.SimulationError("too stiff", step=10, node=-1, term=None, trajectory=made)
 
-    monkeypatch.setattr(Task, "trajectory", fail)
+    monkeypatch.setattr(CalibrationProblem, "trajectory", fail)
     arguments = [str(recording), *SMALL, "--frames", "4", "--step", "5e-4", "--output", str(usd)]
     assert exit_code(scene_script, arguments) == 1
     assert "too stiff" in capsys.readouterr().err
@@ -743,14 +761,14 @@ def test_an_interrupted_command_is_resumed(recording, tmp_path, monkeypatch, cap
     usd.with_suffix(".checkpoint.npz").unlink()
     calls = []
 
-    def residuals(self, values, real=Task.residuals):
+    def residuals(self, values, real=CalibrationProblem.residuals):
         calls.append(values)
         if len(calls) == 8:
             raise KeyboardInterrupt
         return real(self, values)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Task, "residuals", residuals)
+        patch.setattr(CalibrationProblem, "residuals", residuals)
         assert exit_code(scene_script, arguments) == 130
     assert "--resume goes on from" in capsys.readouterr().err
     resumed = scene_script.main([*arguments, "--resume"])
