@@ -12,10 +12,11 @@ import pytest
 import torch
 import torch.utils.checkpoint
 import warp as wp
-import warp_yarn.torch as wt
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.device import arrays
+from warp_yarn.gradients.inputs import NUMBERS, VECTORS
 
 YARNS = [wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4), wy.Yarn(density=2.5e-3, stretch=1.7e5, bend=1.1e-4)]
 WIND = wy.Wind(velocity=(0.3, 5.0, -0.2))
@@ -154,7 +155,7 @@ def hung(friction: float, friction_damping: float, steps: int = 50) -> tuple[wt.
     fabric = cloth(6, 6, "twill", friction=friction, friction_damping=friction_damping)
     scene = wy.Scene(fabric, wind=wy.Wind(velocity=(0.0, 5.0, 0.0)), pins=fabric.corners("top"))
     rollout = wt.Rollout(scene, steps, integrator="linear", tolerance=EXACT)
-    values = {name: rollout.defaults[name] for name in (*wt.NUMBERS, *wt.VECTORS)}
+    values = {name: rollout.defaults[name] for name in (*NUMBERS, *VECTORS)}
     for name in ("density", "stretch", "bend"):
         values[name] = torch.tensor([getattr(yarn, name) for yarn in YARNS], dtype=torch.float64)
     return rollout, values
@@ -480,7 +481,7 @@ def made_with(name: str, value: float) -> None:
         cloth(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["density", "stretch", "bend", *wt.NUMBERS])
+@pytest.mark.parametrize("name", ["density", "stretch", "bend", *NUMBERS])
 @pytest.mark.parametrize("value", [-1e-4, -0.0, 0.0, 1e-3, float("inf")])
 def test_tensors_have_the_ranges_of_numbers(name: str, value: float) -> None:
     rollout = wt.Rollout(scene_for("plain", 1), 1, integrator="linear")

@@ -30,3 +30,13 @@ def test_names_that_users_write_are_quiet() -> None:
 def test_an_unknown_name_is_no_module() -> None:
     with pytest.raises(ModuleNotFoundError, match=r"warp_yarn\.nothing"):
         importlib.import_module("warp_yarn.nothing")
+
+
+def test_names_of_before_in_modules_work_and_say_so() -> None:
+    """A Fabric was beside the Rollout, and is among what users write."""
+    rollout = importlib.import_module("warp_yarn.gradients.rollout")
+    with pytest.warns(DeprecationWarning, match=r"gradients\.rollout\.Fabric is warp_yarn\.torch\.Fabric now"):
+        assert rollout.Fabric is wy.torch.Fabric
+    assert wy.torch.Rollout is rollout.Rollout and wy.torch.Frames is rollout.Frames
+    with pytest.raises(AttributeError, match="no attribute 'Fabrics'"):
+        _ = rollout.Fabrics

@@ -28,12 +28,11 @@ MOVED = {
     "state": "simulation.state",
     "system": "simulation.linear_system",
     "topology": "description.topology",
-    "torch": "gradients.rollout",
     "usd": "io.usd",
     "weave": "description.weave",
 }
 """Old name of a module in the package, and its new one."""
-QUIET = ("fabrics", "learn", "paper", "torch")
+QUIET = ("fabrics", "learn", "paper")
 """Names that users write, as ``warp_yarn.paper``: these are no mistake."""
 
 

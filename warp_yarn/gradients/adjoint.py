@@ -39,15 +39,15 @@ class Adjoint:
             if f"loss_{name}" not in a:
                 array, frames = a[name], simulator.chunk + 1
                 a[f"loss_{name}"] = None if array is None else a.zeros(frames * array.shape[0], array.dtype)
-        simulator.integrator.prepare_adjoint(self._receive, self._give)
+        simulator.integrator.prepare_adjoint(self._add_loss_gradient, self._scatter_gradient)
 
-    def _receive(self) -> None:
-        """Takes in what the loss asks of the present frame."""
+    def _add_loss_gradient(self) -> None:
+        """Adds what the loss asks of the present frame to the running adjoints."""
         frames = {f"frame_{name}_grad": self.arrays[f"loss_{name}"] for name in STATE_TYPES}
         self.simulator.model.launch("receive", "nodes", **frames)
 
-    def _give(self, stage: int) -> None:
-        """Hands what a stage gave to inputs that change from step to step to the rows of their paths."""
+    def _scatter_gradient(self, stage: int) -> None:
+        """Adds what a stage gave to inputs that change from step to step to the rows of their paths."""
         for name in self.moving:
             self.simulator.model.give_inputs(name, stage)
 
@@ -81,15 +81,20 @@ class Adjoint:
                     self._fail(first + k)
 
     def finish(self) -> None:
-        """Takes in what the loss asks of the first frame; the running adjoints are then those of the initial state."""
+        """Adds what the loss asks of the first frame; the running adjoints are then those of the initial state.
+
+        Raises:
+            GradientError: a gradient that is not finite.
+        """
         self.arrays.zero("counters")
-        self._receive()
+        self._add_loss_gradient()
         for name in self.wanted:
             array = self.arrays[name]
             if array is not None and not np.isfinite(array.grad.numpy()).all():
                 raise GradientError(f"the gradient with respect to {name!r} is not finite", step=0, term=None)
 
     def _fail(self, k: int) -> None:
+        """Raises a GradientError that says what went wrong at a step."""
         a = self.arrays
         code, node = (int(value) for value in a["status"].numpy()[:2])
         a.zero("status")
@@ -109,7 +114,7 @@ class Adjoint:
         raise GradientError(message, step=k, term=term)
 
     def _blame(self) -> str | None:
-        """The kernel whose reverse first writes something that is not finite, in the step that is on the device."""
+        """Finds the kernel whose reverse first writes what is not finite, in the step that is on the device."""
         for launch in reversed(self.simulator.integrator.tape.launches):
             gradients = [array.grad for array in launch[3] if isinstance(array, wp.array) and array.grad is not None]
             if any(not np.isfinite(gradient.numpy()).all() for gradient in gradients):

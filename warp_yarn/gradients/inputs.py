@@ -1,0 +1,173 @@
+"""What a rollout can be given: every number of a scene and its state, by name, with the shape and the range it has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..device.arrays import YARN_PARAMETERS
+from ..errors import InputError, number
+from ..simulation.simulator import Simulator
+from ..simulation.state import FIELDS, State
+
+NUMBERS = (
+    "shear",
+    "friction",
+    "friction_stiffness",
+    "friction_damping",
+    "friction_sharpness",
+    "parallel_stiffness",
+    "wind_density",
+    "wind_drag",
+    "pin_stiffness",
+)
+VECTORS = ("gravity", "wind_velocity")
+ABOVE_0 = ("density", "friction_stiffness", "friction_sharpness", "pin_stiffness")
+"""Of the yarns' parameters and the numbers; the others are at least 0: the ranges of Yarn, Cloth, Wind and Scene."""
+ARRAY_OF_PATH = {"pin_path": "pin_target", "forces": "applied_force"}
+"""Inputs that may change from step to step, and the arrays that hold a step's row of them."""
+
+
+class Inputs:
+    """The inputs of a scene, as tensors of a simulator's precision and device.
+
+    Args:
+        simulator: of the scene.
+
+    Attributes:
+        dtype, device: of the tensors.
+        defaults: the scene's own value of everything, density, stretch and bend by yarn.
+        shapes: name and shape of everything that a call takes, density, stretch and bend by material too.
+    """
+
+    def __init__(self, simulator: Simulator):
+        self.cloth = simulator.scene.cloth
+        self.dtype = {"double": torch.float64, "single": torch.float32}[simulator.model.precision]
+        self.device = wp.device_to_torch(simulator.model.device)
+        self.defaults = self._scene_values(simulator)
+        self.shapes = {name: tuple(value.shape) for name, value in self.defaults.items()}
+        for name in YARN_PARAMETERS:
+            self.shapes[f"yarn_{name}"] = self.shapes[name]
+            self.shapes[name] = (len(self.cloth.yarns),)
+
+    def _scene_values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
+        """Reads the scene's own values from the device."""
+        arrays = simulator.arrays
+        names = [*YARN_PARAMETERS, *NUMBERS, *VECTORS]
+        values = {name: arrays[name].numpy() for name in names if arrays.get(name) is not None}
+        values = {k: v.reshape(()) if k in NUMBERS else v.reshape(-1) for k, v in values.items()}
+        for name, array in ARRAY_OF_PATH.items():
+            if f"{array}_path" in arrays:
+                path = arrays[f"{array}_path"].numpy().reshape(-1, len(arrays[array]), 3)
+                values[name] = path[:-1] if name == "forces" else path
+            elif array in arrays:
+                values[name] = arrays[array].numpy()
+        state = simulator.state
+        values |= {name: getattr(state, name) for name in FIELDS}
+        return {name: torch.tensor(value, dtype=self.dtype, device=self.device) for name, value in values.items()}
+
+    def by_yarn(self, state: State | None, given: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+        """Checks what a call is given, and takes it to the names and shapes of ``defaults``; differentiable.
+
+        Raises:
+            InputError: an input that is given twice, or as of ``checked``.
+        """
+        inputs = dict(given)
+        if state is not None and not isinstance(state, State):
+            raise InputError(f"state = {state!r}, must be a State, such as frames.last")
+        for name in FIELDS if state is not None else ():
+            if name in inputs:
+                raise InputError(f"state and {name} are both given, must be one of them")
+            if getattr(state, name) is not None:
+                inputs[name] = getattr(state, name)
+        values = {name: self.checked(name, value) for name, value in inputs.items()}
+        material = torch.as_tensor(self.cloth.material, device=self.device)
+        for name in YARN_PARAMETERS:
+            if name in values and f"yarn_{name}" in values:
+                raise InputError(f"{name} and yarn_{name} are both given, must be one of them")
+            if name in values:
+                values[name] = values[name][material]
+            elif f"yarn_{name}" in values:
+                values[name] = values.pop(f"yarn_{name}")
+        if "euler_velocity" in values:
+            crossing = torch.as_tensor(self.cloth.topology.is_crossing != 0, device=self.device)
+            values["euler_velocity"] = values["euler_velocity"] * crossing[:, None]
+        if "euler" in values:
+            values.setdefault("anchor", values["euler"])
+        return values
+
+    def checked(self, name: str, value: Any) -> torch.Tensor:
+        """Makes a tensor of an input, a copy.
+
+        Raises:
+            InputError: an input that the scene does not have, of another shape, not real, not finite, or out of the
+                range that Yarn, Cloth, Wind and Scene give.
+        """
+        if name not in self.shapes:
+            raise InputError(
+                f"{name!r} is no input of this scene, so it is fixed and has no gradient; "
+                f"the inputs are {', '.join(sorted(self.shapes))}"
+            )
+        tensor = real_tensor(name, value).to(device=self.device, dtype=self.dtype)
+        if name in NUMBERS and tensor.shape == (1,):
+            tensor = tensor.reshape(())
+        if tuple(tensor.shape) != self.shapes[name]:
+            raise InputError(f"{name} has shape {tuple(tensor.shape)}, must be {self.shapes[name]}")
+        if not bool(torch.isfinite(tensor).all()):
+            raise InputError(f"{name} is not finite: {tensor.detach()}")
+        if allowed_range(name):
+            at = int(tensor.argmin())
+            number(f"{name}[{at}]" if tensor.ndim else name, tensor.reshape(-1)[at].item(), **allowed_range(name))
+        # Whoever changes theirs in place before the backward pass shall not change this run's.
+        return tensor.clone()
+
+
+def array_of(name: str, value: torch.Tensor) -> str:
+    """Names the array that holds an input: of one that changes from step to step, the rows of its path."""
+    array = ARRAY_OF_PATH.get(name, name)
+    return f"{array}_path" if name in ARRAY_OF_PATH and value.ndim == 3 else array
+
+
+def allowed_range(name: str) -> dict[str, float]:
+    """Says what ``number`` is to check of an input."""
+    name = name.removeprefix("yarn_")
+    if name not in (*YARN_PARAMETERS, *NUMBERS):
+        return {}
+    return {"above": 0.0} if name in ABOVE_0 else {"least": 0.0}
+
+
+def real_tensor(name: str, value: Any) -> torch.Tensor:
+    """Makes a dense tensor of real numbers of a value, or raises an InputError."""
+    if not isinstance(value, torch.Tensor):
+        try:
+            array = np.asarray(value)
+        except (TypeError, ValueError, RuntimeError) as error:  # ragged, or a list of tensors that need a gradient
+            raise InputError(f"{name} must be a tensor or an array of numbers ({error}), got {value!r}") from error
+        if array.dtype.kind not in "fiub":
+            raise InputError(f"{name} must be a tensor or an array of real numbers, got {value!r}")
+        return torch.as_tensor(array.astype(np.float64))
+    if value.is_complex() or value.layout != torch.strided:
+        raise InputError(f"{name} is a tensor of {value.dtype}, {value.layout}: it must be one of real numbers, dense")
+    return value
+
+
+def refuse_transforms(*tensors: torch.Tensor | None) -> None:
+    """Refuses what stands for other tensors, as transforms have them, and has no numbers of its own."""
+    if torch.jit.is_tracing():  # which would keep this run's frames as constants
+        raise InputError("a Rollout cannot be traced by torch.jit: torch runs none of its steps")
+    transformed = torch._C._are_functorch_transforms_active()  # no public function says so
+    try:
+        for tensor in tensors:
+            if tensor is not None:
+                tensor.data_ptr()
+    except RuntimeError:
+        transformed = True
+    if transformed:
+        raise InputError(
+            "a Rollout cannot be transformed by torch.func (vmap, grad, ...), nor its gradients batched: call it, and "
+            "torch.autograd, one by one"
+        )
