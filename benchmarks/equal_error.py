@@ -23,7 +23,8 @@ import numpy as np
 import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, turns, write_csv
 from motions import Motion, add_options, find
-from work_precision import EQ_2, TARGETS, Reference, end, reference
+from references import TARGETS, Reference, end, reference
+from work_precision import EQ_2
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS

@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, turns, write_csv
 from motions import Motion, add_options, find
-from work_precision import end, reference
+from references import end, reference
 
 import warp_yarn as wy
 

@@ -35,123 +35,33 @@ from typing import Any
 import numpy as np
 import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, write_csv
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from motions import Motion, add_options, distance, find
+from motions import Motion, add_options, find
 from plots import COLORS, MARKERS, PICTURES, save
+from references import REFERENCE, TARGETS, Reference, end, reference
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
 
 STEPS = tuple(1e-3 / k for k in (0.2, 0.4, 1, 2, 4, 8, 16, 32, 64, 128, 256))
-"""From 5 ms down; each fits whole times into every motion."""
+"""From the longest down [s]; each fits whole times into every motion."""
 
 CURVES = {"double": (None, 1e-2, 1e-4), "single": (None,)}
 """Solver tolerances by precision; None: the default ones."""
 
-TARGETS = (1e-2, 1e-3)
-"""Errors of which the table says what reaching them takes."""
+LAST_ERROR = 2e-4
+"""A curve ends below this error [of the motion]: it has passed the targets."""
 
-ENOUGH = 2e-4
-"""A curve ends below this error: it has passed the targets."""
+LARGEST_ERROR_OF_SLOPE = 0.01
+"""Errors above this have no part in a slope [of the motion]."""
 
-ASYMPTOTIC = 0.01
-"""Errors above this have no part in a slope."""
-
-EXACT = {"tolerance": 1e-12, "newton_tolerance": 1e-9}
-"""Of the runs that the reference is made of."""
-
-REFERENCE = "sdirk2"
 EQ_2 = "linear"
-
-
-# -- the converged motion ---------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class Reference:
-    """Where a motion ends.
-
-    Args:
-        position: converged [nodes, 3] (m).
-        moved: root mean square displacement from the beginning [m].
-        check: the method that it was checked by.
-        uncertainty: distance of the two methods' results, relative to what was moved.
-    """
-
-    position: np.ndarray
-    moved: float
-    check: str
-    uncertainty: float
-
-    @property
-    def floor(self) -> float:
-        """The smallest error that is told from the reference's own."""
-        return 10.0 * self.uncertainty
-
-    def error(self, position: np.ndarray) -> float:
-        return distance(position, self.position) / self.moved
-
-
-def extrapolated(ends: Sequence[np.ndarray], order: int) -> np.ndarray:
-    """Of results at halving steps, the coarsest first, the limit: leading powers of the step taken out in turn."""
-    for power in itertools.count(order):
-        if len(ends) == 1:
-            return ends[0]
-        factor = 2.0**power
-        ends = [(factor * fine - coarse) / (factor - 1.0) for coarse, fine in itertools.pairwise(ends)]
-    raise AssertionError
-
-
-def converged(motion: Motion, size: int, method: str) -> np.ndarray:
-    """Positions at the end, by one method alone; one of first order takes eight times the steps."""
-    order = INTEGRATORS[method].order
-    finest = motion.finest if order > 1 else motion.finest / 8.0
-    ends = []
-    for step in (4.0 * finest, 2.0 * finest, finest):
-        simulator = motion.simulator(size, step=step, integrator=method, **EXACT)
-        ends.append(end(simulator, motion.steps(step)))
-    return extrapolated(ends, order)
-
-
-def checks() -> list[str]:
-    """Methods that may check the reference, the one of the highest order first."""
-    others = [name for name in INTEGRATORS if name != REFERENCE]
-    return sorted(others, key=lambda name: -INTEGRATORS[name].order)
-
-
-def reference(motion: Motion, size: int) -> Reference:
-    """The converged motion by the reference method, checked by another: the first that is near enough for the
-    targets, or else the nearest."""
-    position = converged(motion, size, REFERENCE)
-    moved = motion.moved(position, size)
-    best = None
-    for method in checks():
-        try:
-            found = Reference(position, moved, method, distance(position, converged(motion, size, method)) / moved)
-        except wy.SimulationError as error:
-            print(f"{method} cannot check the reference: {error}")
-            continue
-        if best is None or found.uncertainty < best.uncertainty:
-            best = found
-        if best.floor <= 0.5 * min(TARGETS):
-            break
-    if best is None:
-        raise RuntimeError("no method but one makes this motion: there is no reference")
-    return best
+"""The paper's method."""
 
 
 # -- runs -------------------------------------------------------------------------------------------------------------
-
-
-def end(simulator: wy.Simulator, steps: int) -> np.ndarray:
-    """Positions after so many steps; their frames are kept in pieces, as the finest runs have many."""
-    while True:
-        count = min(steps, 500)
-        position = simulator.run(count).position[-1]
-        steps -= count
-        if steps == 0:
-            return position
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,6 +81,7 @@ class Curve:
 
     @property
     def columns(self) -> dict[str, Any]:
+        """What the table says of it."""
         return {
             "motion": self.motion,
             "fabric": self.made.fabric,
@@ -180,6 +91,7 @@ class Curve:
         }
 
     def simulator(self, size: int, step: float) -> wy.Simulator:
+        """Makes a simulator of the motion at its beginning."""
         options = {"tolerance": self.tolerance, "newton_tolerance": self.tolerance, "precision": self.precision}
         return self.made.simulator(size, step=step, integrator=self.method, **options)
 
@@ -205,6 +117,7 @@ class Point:
     failure: str = ""
 
     def columns(self, floor: float) -> dict[str, Any]:
+        """Says what the table has of it; errors below the floor are not charted."""
         timing = self.timing
         return {
             "step [ms]": 1e3 * self.step,
@@ -219,7 +132,7 @@ class Point:
 
 
 def point(curve: Curve, size: int, step: float, converged: Reference, repeats: int) -> Point:
-    """Runs of a curve at one step size."""
+    """Makes runs of a curve at one step size."""
     motion = curve.made
     begin = time.perf_counter()
     simulator = curve.simulator(size, step)
@@ -243,12 +156,12 @@ def point(curve: Curve, size: int, step: float, converged: Reference, repeats: i
 
 
 def points(curve: Curve, size: int, converged: Reference, repeats: int, longest: float) -> list[Point]:
-    """All of a curve, from the largest step down."""
+    """Makes all points of a curve, from the largest step down."""
     duration, result = curve.made.duration, []
     for step in STEPS:
         result.append(point(curve, size, step, converged, repeats))
         last = result[-1]
-        if last.error is not None and last.error < max(ENOUGH, converged.floor):
+        if last.error is not None and last.error < max(LAST_ERROR, converged.floor):
             break
         # half a step costs nearly twice as much
         if last.error is not None and 2.0 * last.timing.median * duration > longest:
@@ -260,15 +173,15 @@ def points(curve: Curve, size: int, converged: Reference, repeats: int, longest:
 
 
 def slope(points: Sequence[Point], floor: float) -> float | None:
-    """Of error over step, both as logarithms; None where fewer than three points tell."""
-    told = [p for p in points if p.error is not None and floor <= p.error <= ASYMPTOTIC]
+    """Fits the slope of error over step, both as logarithms; None where fewer than three points tell."""
+    told = [p for p in points if p.error is not None and floor <= p.error <= LARGEST_ERROR_OF_SLOPE]
     if len(told) < 3:
         return None
     return float(np.polyfit(np.log([p.step for p in told]), np.log([p.error for p in told]), 1)[0])
 
 
 def time_to(points: Sequence[Point], target: float) -> tuple[float, bool] | None:
-    """Wall time per simulated second from which on a curve is nearer than the target.
+    """Finds the wall time per simulated second from which on a curve is nearer than the target.
 
     Returns:
         The time, and whether that is only an upper bound, as the curve's largest step is nearer already; or None: it
@@ -286,7 +199,7 @@ def time_to(points: Sequence[Point], target: float) -> tuple[float, bool] | None
 
 
 def summary(found: dict[Curve, list[Point]], floor: float) -> list[dict[str, Any]]:
-    """A row for each curve of one motion: its slope and what the targets take."""
+    """Makes a row for each curve of one motion: its slope and what the targets take."""
     best = {}
     for target in TARGETS:
         times = [time_to(points, target) for curve, points in found.items() if curve.method == EQ_2]
@@ -313,9 +226,12 @@ def summary(found: dict[Curve, list[Point]], floor: float) -> list[dict[str, Any
 # -- the chart --------------------------------------------------------------------------------------------------------
 
 
+IN_PARTS: dict[str, Any] = {"color": "0.2", "marker": "o", "markersize": 10, "fillstyle": "none", "linestyle": ""}
+"""Rings around points at which steps were made in parts."""
+
+
 def draw(found: dict[Curve, list[Point]], references: dict[str, Reference], size: int) -> Figure:
-    """A panel for each motion, four in a row."""
-    look = {name: (COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]) for k, name in enumerate(INTEGRATORS)}
+    """Draws a panel for each motion, four in a row, and the legend of all."""
     tolerances = sorted({curve.tolerance for curve in found if curve.tolerance is not None}, reverse=True)
     dashes = {tolerance: (":", "--", "-.")[k % 3] for k, tolerance in enumerate(tolerances)}
     across = min(len(references), 4)
@@ -326,71 +242,13 @@ def draw(found: dict[Curve, list[Point]], references: dict[str, Reference], size
     for axes in grid[len(references) :]:
         axes.remove()
     for axes, (name, converged) in zip(panels, references.items(), strict=True):
-        failed, slopes = [], []
-        for curve, points in found.items():
-            if curve.motion != name:
-                continue
-            color, marker = look[curve.method]
-            main, single = curve.tolerance is None, curve.precision == "single"
-            style = {
-                "color": color,
-                "linestyle": "-" if main else dashes[curve.tolerance],
-                "linewidth": 1.6 if main else 0.9,
-                "alpha": 1.0 if main else 0.6,
-                "marker": marker,
-                "markersize": 6.0 if main else 3.5,
-                "markerfacecolor": "white" if single else color,
-                "zorder": 3 if main else 2,
-            }
-            told = [p for p in points if p.error is not None and p.error >= converged.floor]
-            axes.plot([p.timing.median for p in told], [p.error for p in told], **style)
-            split = [p for p in told if p.split]
-            axes.plot(
-                [p.timing.median for p in split],
-                [p.error for p in split],
-                "o",
-                color="0.2",
-                markersize=10,
-                fillstyle="none",
-            )
-            failed += [(p.timing.median, color) for p in points if p.error is None]
-            if main and not single:
-                fitted = slope(points, converged.floor)
-                slopes.append(
-                    (Line2D([], [], **style), f"{curve.method}: {'–' if fitted is None else f'{fitted:.2f}'}")
-                )
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        limits = axes.get_xlim()
-        for seconds, color in failed:
-            at = min(max(seconds, limits[0] * 1.05), limits[1] / 1.05)
-            axes.plot(at, 0.97, "x", color=color, transform=axes.get_xaxis_transform())
-        axes.set_xlim(limits)
-        made = next(curve.made for curve in found if curve.motion == name)
-        axes.set_title(f"{made.title}: {made.fabric}, {made.about(size)['size']}")
-        axes.set_xlabel("wall time per simulated second [s]")
-        axes.grid(which="major", alpha=0.3)
-        for target in TARGETS:
-            axes.axhline(target, color="0.4", linewidth=0.8, linestyle=(0, (1, 3)))
-        handles, labels = zip(*slopes, strict=True)
-        axes.legend(handles, labels, title="slope of error over step", fontsize=8, title_fontsize=8, loc="lower left")
+        draw_panel(axes, {c: points for c, points in found.items() if c.motion == name}, converged, size, dashes)
     for axes in panels[::across]:
         axes.set_ylabel("position error, relative to the motion")
     # room below for the legend, above for what failed
     lowest, highest = min(axes.dataLim.y0 for axes in panels), max(axes.dataLim.y1 for axes in panels)
     panels[0].set_ylim(lowest / 50.0, 3.0 * highest)
-    grey = {"color": "0.2", "marker": "o"}
-    styles = {
-        "double precision": Line2D([], [], **grey),
-        "single precision": Line2D([], [], **grey, markerfacecolor="white"),
-        "some steps in parts": Line2D([], [], color="0.2", marker="o", markersize=10, fillstyle="none", linestyle=""),
-        "failed: time until then": Line2D([], [], color="0.2", marker="x", linestyle=""),
-        "default tolerances": Line2D([], [], color="0.2", linewidth=1.6),
-        **{
-            f"tolerances {t:.0e}": Line2D([], [], color="0.2", linewidth=0.9, linestyle=dash)
-            for t, dash in dashes.items()
-        },
-    }
+    styles = legend(dashes)
     figure.legend(
         styles.values(), styles, loc="outside lower center", ncols=min(len(styles), 2 * across + 2), fontsize=9
     )
@@ -398,7 +256,68 @@ def draw(found: dict[Curve, list[Point]], references: dict[str, Reference], size
     return figure
 
 
+def draw_panel(
+    axes: Axes, found: dict[Curve, list[Point]], converged: Reference, size: int, dashes: dict[float, str]
+) -> None:
+    """Draws the curves of one motion, with their slopes; what failed is at the top."""
+    look = {name: (COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]) for k, name in enumerate(INTEGRATORS)}
+    failed, slopes = [], []
+    for curve, points in found.items():
+        color, marker = look[curve.method]
+        main, single = curve.tolerance is None, curve.precision == "single"
+        style = {
+            "color": color,
+            "linestyle": "-" if main else dashes[curve.tolerance],
+            "linewidth": 1.6 if main else 0.9,
+            "alpha": 1.0 if main else 0.6,
+            "marker": marker,
+            "markersize": 6.0 if main else 3.5,
+            "markerfacecolor": "white" if single else color,
+            "zorder": 3 if main else 2,
+        }
+        told = [p for p in points if p.error is not None and p.error >= converged.floor]
+        axes.plot([p.timing.median for p in told], [p.error for p in told], **style)
+        split = [p for p in told if p.split]
+        axes.plot([p.timing.median for p in split], [p.error for p in split], **IN_PARTS)
+        failed += [(p.timing.median, color) for p in points if p.error is None]
+        if main and not single:
+            fitted = slope(points, converged.floor)
+            slopes.append((Line2D([], [], **style), f"{curve.method}: {'–' if fitted is None else f'{fitted:.2f}'}"))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    limits = axes.get_xlim()
+    for seconds, color in failed:
+        at = min(max(seconds, limits[0] * 1.05), limits[1] / 1.05)
+        axes.plot(at, 0.97, "x", color=color, transform=axes.get_xaxis_transform())
+    axes.set_xlim(limits)
+    made = next(curve.made for curve in found)
+    axes.set_title(f"{made.title}: {made.fabric}, {made.about(size)['size']}")
+    axes.set_xlabel("wall time per simulated second [s]")
+    axes.grid(which="major", alpha=0.3)
+    for target in TARGETS:
+        axes.axhline(target, color="0.4", linewidth=0.8, linestyle=(0, (1, 3)))
+    handles, labels = zip(*slopes, strict=True)
+    axes.legend(handles, labels, title="slope of error over step", fontsize=8, title_fontsize=8, loc="lower left")
+
+
+def legend(dashes: dict[float, str]) -> dict[str, Line2D]:
+    """Says what markers and lines mean in all panels."""
+    grey = {"color": "0.2", "marker": "o"}
+    lines = {
+        f"tolerances {t:.0e}": Line2D([], [], color="0.2", linewidth=0.9, linestyle=dash) for t, dash in dashes.items()
+    }
+    return {
+        "double precision": Line2D([], [], **grey),
+        "single precision": Line2D([], [], **grey, markerfacecolor="white"),
+        "some steps in parts": Line2D([], [], **IN_PARTS),
+        "failed: time until then": Line2D([], [], color="0.2", marker="x", linestyle=""),
+        "default tolerances": Line2D([], [], color="0.2", linewidth=1.6),
+        **lines,
+    }
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Makes the tables and the chart."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=17, help="rows and columns (%(default)s)")
     add_options(parser)

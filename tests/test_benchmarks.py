@@ -15,6 +15,7 @@ from warp_yarn.simulation import ablation
 from warp_yarn.simulation.ablation import ablate
 
 solver = load("benchmarks/solver.py")
+references = load("benchmarks/references.py")
 work = load("benchmarks/work_precision.py")
 equal = load("benchmarks/equal_error.py")
 control = load("benchmarks/step_control.py")
@@ -80,7 +81,7 @@ def test_extrapolation_takes_the_leading_powers_out():
     limit, rough = np.array([[1.0, 2.0, 3.0]]), np.array([[4.0, -5.0, 6.0]])
     for order in (1, 2):
         ends = [limit + rough * h**order + 7.0 * rough * h ** (order + 1) for h in (0.4, 0.2, 0.1)]
-        np.testing.assert_allclose(work.extrapolated(ends, order), limit, rtol=1e-12)
+        np.testing.assert_allclose(references.extrapolated(ends, order), limit, rtol=1e-12)
 
 
 def test_a_slope_is_fitted_to_what_is_charted():
@@ -118,9 +119,9 @@ def test_steps_fit_into_the_motions():
 
 def test_two_methods_agree_on_the_reference(monkeypatch):
     monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
-    found = work.reference(SHORT, 4)
+    found = references.reference(SHORT, 4)
     assert found.check in work.INTEGRATORS
-    assert found.check != work.REFERENCE
+    assert found.check != references.REFERENCE
     # seen: 9e-6; the errors below are 1000 times it
     assert found.uncertainty < 3e-5
     curve = work.Curve("hung", "linear", "double", None)
@@ -137,7 +138,7 @@ def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
     # squares of such velocities are not finite
     monkeypatch.setitem(motions.MOTIONS, "hung", dataclasses.replace(SHORT, speed=(0.0, 0.0, 1e200)))
     curve = work.Curve("hung", "linear", "double", None)
-    converged = work.Reference(np.zeros((16, 3)), 1.0, "none", 1e-5)
+    converged = references.Reference(np.zeros((16, 3)), 1.0, "none", 1e-5)
     failed = work.point(curve, 4, 1e-3, converged, repeats=1)
     assert failed.error is None
     assert "not finite" in failed.failure
@@ -170,7 +171,7 @@ def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
 
 # -- benchmarks/motions.py --------------------------------------------------------------------------------------------
 
-EXACT = work.EXACT
+EXACT = references.EXACT
 """Tolerances near rounding."""
 norm = np.linalg.norm
 
@@ -183,7 +184,7 @@ def test_a_motion_is_made_of_any_fabric(name, fabric):
     simulator = motion.simulator(5, step=1e-3, **EXACT)
     assert simulator.scene.cloth.yarns == wy.fabrics.FABRICS[motion.fabric]().yarns
     assert motion.about(5) == {"fabric": motion.fabric, "size": "5 × 5"}
-    position = work.end(simulator, 2)
+    position = references.end(simulator, 2)
     moved = position - motion.cloth(5).position - 2e-3 * np.array(motion.speed)
     # 2 ms of gravity and wind, or of spinning at 37 rad/s 3 mm from the centre: some 2e-4 m
     assert 1e-9 < np.abs(moved).max() < 3e-3
@@ -291,7 +292,7 @@ def test_parts_are_compared_with_even_steps_of_their_error(monkeypatch):
     motion = motions.MOTIONS["hung"]
     position = control.end(motion.simulator(3, step=2.5e-4), 100)
     moved = motion.moved(position, 3)
-    monkeypatch.setattr(control, "reference", lambda motion, size: work.Reference(position, moved, "", 0.0))
+    monkeypatch.setattr(control, "reference", lambda motion, size: references.Reference(position, moved, "", 0.0))
     monkeypatch.setattr(control, "COUNTS", (5, 80))
     monkeypatch.setattr(control, "STEP_ERRORS", (1e-2, 1e-3))
     # even steps take a second each
@@ -309,8 +310,8 @@ def test_step_control_from_the_command(monkeypatch, tmp_path):
     monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
     monkeypatch.setattr(control, "COUNTS", (5, 20))
     monkeypatch.setattr(control, "STEP_ERRORS", (1e-2,))
-    end = work.end(SHORT.simulator(3, step=1e-4), 50)
-    monkeypatch.setattr(control, "reference", lambda motion, size: work.Reference(end, 1e-4, "", 0.0))
+    end = references.end(SHORT.simulator(3, step=1e-4), 50)
+    monkeypatch.setattr(control, "reference", lambda motion, size: references.Reference(end, 1e-4, "", 0.0))
     output = tmp_path / "c.csv"
     control.main(["--size", "3", "--motions", "hung", "--fabric", "paper", "--repeats", "1", "--output", str(output)])
     with open(output, newline="") as file:
