@@ -41,7 +41,7 @@ TERMS_BY_NAME = {f"{W}.description.scene"}
 """A scene looks up which terms there are; no other description knows kernels."""
 
 ONLY = {
-    "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "rollout", "run")}
+    "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "parts", "rollout", "run")}
     | {f"{W}.calibration.problem"},
     "pxr": {f"{W}.io.usd"},
     "h5py": {f"{W}.io.published"},

@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
-import warp_yarn.torch as wt
 from test_gradients import GROUPS, WIND, cloth, jittered, scaled, scene_for
 from warp_yarn.kernels.core.status import STALLED
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
 
 BEYOND_EQ_2 = [name for name in INTEGRATORS if name != "linear"]
@@ -317,23 +317,6 @@ def test_exact_pins_move_evenly_through_the_parts_of_a_step() -> None:
     assert simulator.split_steps == {1: 2.5e-4}
     assert after.position[0] == pytest.approx(target[0, 0], abs=1e-15)
     assert after.velocity[0] == pytest.approx((0.0, 0.0, 0.2), abs=1e-12)
-
-
-def test_a_split_step_has_no_gradient() -> None:
-    scene, state = colliding(7.0)
-    rollout = wt.Rollout(scene, 2)
-    density = torch.tensor([2.0e-3, 2.5e-3], dtype=torch.float64, requires_grad=True)
-    # the call says so, which needs none of the steps after it
-    moving = {"euler_velocity": torch.as_tensor(state.euler_velocity), "steps_done": 5}
-    with pytest.raises(
-        wy.GradientError, match=r"step 1 could only be made in parts, .* smaller step than 0\.001 s"
-    ) as error:
-        rollout(density=density, **moving)
-    assert error.value.step == 1
-    # where no gradient is needed it is a step as others
-    with torch.no_grad():
-        frames = rollout(density=density, **moving)
-    assert torch.equal(frames.position, rollout(density=density.detach(), **moving).position)
 
 
 def test_a_stage_that_does_not_converge_stops_the_run() -> None:

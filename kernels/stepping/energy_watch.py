@@ -10,8 +10,8 @@ A method of stages has of that work what its stages say: where air or a spring t
 the power at the step's ends says nothing of it.
 
 g is ``GAIN``: what gains more is made again, damped, in parts, or ends the run, for it would be wrong without saying
-so, or blow up. It is ``BLOW_UP`` of methods that have no stages, and of runs that must have a gradient, since a step in
-parts has none.
+so, or blow up. It is ``BLOW_UP`` of methods that have no stages, and of runs that must have a gradient, whose loss
+jumps where a step is made otherwise.
 """
 
 import functools

@@ -198,7 +198,7 @@ def _result(search: LevenbergMarquardt, ended: str) -> Result:
     of_residuals = np.sqrt(np.diag(found.covariance))
     try:
         _, gradient = problem.loss_and_gradient(search.values)
-    except GradientError:  # of steps that could only be made in parts
+    except GradientError:  # what was learned is not to be lost for it
         gradient = np.full(len(search.y), np.nan)
 
     def by_name(values: np.ndarray) -> dict[str, float]:

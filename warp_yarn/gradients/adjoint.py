@@ -7,6 +7,8 @@ same matrix (it is symmetric), and runs the assembling kernels in reverse (the i
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -39,7 +41,14 @@ class Adjoint:
             if f"loss_{name}" not in a:
                 array, frames = a[name], simulator.chunk + 1
                 a[f"loss_{name}"] = None if array is None else a.zeros(frames * array.shape[0], array.dtype)
-        simulator.integrator.prepare_adjoint(self._add_loss_gradient, self._scatter_gradient)
+        self._prepared: list[Any] = []
+        self._prepare(simulator.integrator)
+
+    def _prepare(self, method: Any) -> None:
+        """Readies a method of the simulator to go back over its steps."""
+        if method not in self._prepared:
+            method.prepare_adjoint(self._add_loss_gradient, self._scatter_gradient)
+            self._prepared.append(method)
 
     def _add_loss_gradient(self) -> None:
         """Adds what the loss asks of the present frame to the running adjoints."""
@@ -72,13 +81,42 @@ class Adjoint:
         Raises:
             GradientError: where an adjoint is not finite, or its solve does not converge.
         """
-        a = self.arrays
-        a.put("counters", steps, before + first + steps)
+        self.arrays.put("counters", steps, before + first + steps)
         with self.simulator.model.team():
             for k in range(steps, 0, -1):
-                self.simulator.integrator.retreat()
-                if a["status"].numpy()[0]:
-                    self._fail(first + k)
+                self._retreat(self.simulator.integrator, first + k)
+
+    def backward_part(self, method: Any, size: float, left: float, step: int, before: int = 0) -> None:
+        """Goes back over a part of a step, from its end, frame 1 on the device, to its start, frame 0.
+
+        What the loss asks of the step's end is for its last part, the first that is taken back; it is 0 afterwards.
+
+        Args:
+            method: the integrator that made it.
+            size: of the step.
+            left: part of the step that was left when it began.
+            step: number of the step in the run, from 1 on.
+            before: as of ``backward_chunk``.
+
+        Raises:
+            GradientError: as of ``backward_chunk``.
+        """
+        self._prepare(method)
+        h = self.simulator.step_size
+        try:
+            method.set_times(size * h, left * h)
+            self.arrays.put("counters", 1, before + step)
+            with self.simulator.model.team():
+                self._retreat(method, step)
+        finally:
+            self.simulator.integrator.set_times(h, h)
+        self.arrays.zero(*(f"loss_{name}" for name in STATE_TYPES))
+
+    def _retreat(self, method: Any, step: int) -> None:
+        """Goes back over what ends at the present frame."""
+        method.retreat()
+        if self.arrays["status"].numpy()[0]:
+            self._fail(method, step)
 
     def finish(self) -> None:
         """Adds what the loss asks of the first frame; the running adjoints are then those of the initial state.
@@ -93,7 +131,7 @@ class Adjoint:
             if array is not None and not np.isfinite(array.grad.numpy()).all():
                 raise GradientError(f"the gradient with respect to {name!r} is not finite", step=0, term=None)
 
-    def _fail(self, k: int) -> None:
+    def _fail(self, method: Any, k: int) -> None:
         """Raises a GradientError that says what went wrong at a step."""
         a = self.arrays
         code, node = (int(value) for value in a["status"].numpy()[:2])
@@ -105,7 +143,7 @@ class Adjoint:
         term = None
         if code == NOT_FINITE:
             message = f"the adjoint of {where} is not finite"
-            term = self._blame()
+            term = self._blame(method)
             if term is not None:
                 message += f"; the first term in reverse order that is not finite is {term!r}"
         else:
@@ -113,9 +151,9 @@ class Adjoint:
             message = f"the adjoint solve of {where} stopped at a residual of {residual:.1e}"
         raise GradientError(message, step=k, term=term)
 
-    def _blame(self) -> str | None:
+    def _blame(self, method: Any) -> str | None:
         """Finds the kernel whose reverse first writes what is not finite, in the step that is on the device."""
-        for launch in reversed(self.simulator.integrator.tape.launches):
+        for launch in reversed(method.tape.launches):
             gradients = [array.grad for array in launch[3] if isinstance(array, wp.array) and array.grad is not None]
             if any(not np.isfinite(gradient.numpy()).all() for gradient in gradients):
                 return launch[0].key

@@ -13,6 +13,7 @@ import torch
 import warp as wp
 
 from ..device.arrays import STATE_TYPES
+from ..errors import GradientError
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS
 
@@ -58,14 +59,25 @@ class Checkpoints:
         else:
             self.store(kept, np.arange(1), done // self.every)
 
-    def bring_back(self, kept: Mapping[str, torch.Tensor], first: int, steps: int, steps_done: int) -> None:
-        """Puts the frames of a chunk on the device again.
+    def bring_back(
+        self,
+        kept: Mapping[str, torch.Tensor],
+        first: int,
+        steps: int,
+        steps_done: int,
+        start: Mapping[str, torch.Tensor] | None = None,
+    ) -> None:
+        """Puts the frames of a chunk, or of a piece of it, on the device again.
 
         Args:
             kept: what the run kept.
-            first: steps of the run before the chunk.
-            steps: of the chunk.
+            first: steps of the run before them.
+            steps: how many.
             steps_done: steps since the beginning, before the run.
+            start: what moves of the state that a piece starts from, where it is not the chunk's first; flat.
+
+        Raises:
+            GradientError: a step that was made at once cannot be made so again.
         """
         simulator = self.simulator
         if self.every == 1:
@@ -73,11 +85,17 @@ class Checkpoints:
                 frames = flat(simulator.arrays[f"frame_{name}"]).view(-1, *source.shape[1:])
                 frames[: steps + 1].copy_(source[first : first + steps + 1])
             return
-        simulator.model.trust_energy()
         for name, source in kept.items():
-            flat(simulator.arrays[name]).copy_(source[first // self.every].reshape(-1))
+            state = source[first // self.every].reshape(-1) if start is None else start[name]
+            flat(simulator.arrays[name]).copy_(state)
         simulator.steps_done = steps_done + first
-        simulator.run_chunk(steps)
+        # after the number of steps, which begins to watch anew
+        simulator.model.trust_energy()
+        made = simulator.run_chunk(steps)
+        again = [k - steps_done for k in simulator.split_steps]
+        if made < steps or again:
+            step = min(again, default=first + made + 1)
+            raise GradientError(f"step {step} was made at once, and could not be made so again", step=step, term=None)
 
 
 def flat(array: wp.array) -> torch.Tensor:

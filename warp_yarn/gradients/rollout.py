@@ -19,7 +19,7 @@ from ..errors import GradientError, InputError, whole
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 from .inputs import Inputs, refuse_transforms
-from .run import DeviceRun
+from .run import DeviceRun, Kept
 
 MOST_STEPS = 2**31 - 1
 """The device counts in 32 bits."""
@@ -139,7 +139,6 @@ class Rollout:
             InputError: an input that the scene does not have, of another shape, not real, not finite, or out of the
                 range that Yarn, Cloth, Wind and Scene give; a call under torch.func, a wp.Tape or a graph's capture.
             SimulationError: a step that could not be made.
-            GradientError: where an input needs a gradient, a step that could only be made in parts.
         """
         refuse_transforms()
         steps_done = whole("steps_done", steps_done, least=0)
@@ -171,8 +170,9 @@ class _Forward(torch.autograd.Function):
         """Makes the run."""
         values = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
         frames, kept = run.forward(values, steps_done, differentiable=True)
-        ctx.run, ctx.names, ctx.kept_names, ctx.steps_done = run, names, tuple(kept), steps_done
-        ctx.save_for_backward(*tensors, *kept.values())
+        ctx.run, ctx.names, ctx.steps_done = run, names, steps_done
+        ctx.kept_names, ctx.split = tuple(kept.states), kept.split
+        ctx.save_for_backward(*tensors, *kept.states.values())
         ctx.set_materialize_grads(False)
         return tuple(frames[name] for name in FIELDS)
 
@@ -181,7 +181,7 @@ class _Forward(torch.autograd.Function):
         """Asks for the gradients of those inputs that need one."""
         ctx.wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[3:], strict=True) if needed]
         saved, inputs = ctx.saved_tensors, len(ctx.names)  # once: torch.utils.checkpoint gives them no second time
-        kept = dict(zip(ctx.kept_names, saved[inputs:], strict=True))
+        kept = Kept(dict(zip(ctx.kept_names, saved[inputs:], strict=True)), ctx.split)
         found = _Backward.apply(ctx, kept, *losses, *saved[:inputs])
         gradients = dict(zip(ctx.wanted, found, strict=True))
         return (None, None, None, *(gradients.get(name) for name in ctx.names))
@@ -200,9 +200,7 @@ class _Backward(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, forward: Any, kept: dict[str, torch.Tensor], *tensors: torch.Tensor | None
-    ) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Any, forward: Any, kept: Kept, *tensors: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
         """Goes back over the run that ``forward`` is the context of."""
         losses = dict(zip(FIELDS, tensors, strict=False))
         values = dict(zip(forward.names, tensors[len(FIELDS) :], strict=True))

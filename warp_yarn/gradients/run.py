@@ -5,19 +5,30 @@ Here torch's tensors meet Warp's arrays, and nothing is recorded by torch: that 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE, refuse_recording
-from ..errors import GradientError
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 from .adjoint import Adjoint
 from .checkpoints import Checkpoints, flat
 from .inputs import ARRAY_OF_PATH, Inputs, array_of
+from .parts import PartsRecorder, SplitStep, pieces
+
+
+class Kept(NamedTuple):
+    """What a run keeps for its backward pass."""
+
+    states: dict[str, torch.Tensor]
+    """What moves of the states that ``Checkpoints`` keeps."""
+    split: dict[int, SplitStep]
+    """Steps that were made in parts, by their number in the run."""
 
 
 class DeviceRun:
@@ -40,7 +51,7 @@ class DeviceRun:
 
     def forward(
         self, values: Mapping[str, torch.Tensor], steps_done: int, *, differentiable: bool
-    ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    ) -> tuple[dict[str, torch.Tensor], Kept]:
         """Makes the steps.
 
         Args:
@@ -49,8 +60,8 @@ class DeviceRun:
             differentiable: whether a backward pass is to follow.
 
         Returns:
-            The frames that are asked for, and the states that the backward pass starts from. They share no memory: a
-            frame that is changed in place would turn the gradient.
+            The frames that are asked for, and what the backward pass starts from. They share no memory: a frame that is
+            changed in place would turn the gradient.
         """
         simulator = self.simulator
         with ALONE:
@@ -58,12 +69,11 @@ class DeviceRun:
             self._upload(values, steps_done)
         kept = self.checkpoints.room() if differentiable else {}
         result = self.checkpoints.room(len(self.frames))
-        done = 0
+        recorder, done = PartsRecorder(simulator, steps_done), 0
         while done < self.steps:
             asked = min(simulator.chunk, self.steps - done)
-            made = simulator.run_chunk(asked)
-            if differentiable:
-                self._refuse_split_steps(steps_done)
+            with recorder.recording() if differentiable else contextlib.nullcontext():
+                made = simulator.run_chunk(asked)
             if made < asked:
                 simulator.fail(done + made + 1, simulator.chunk_trajectory(made + 1))
             inside = np.flatnonzero((self.frames >= done + (done > 0)) & (self.frames <= done + made))
@@ -77,13 +87,13 @@ class DeviceRun:
             name: result[name] if name in result else given[name].expand(len(self.frames), -1, -1).clone()
             for name in FIELDS
         }
-        return frames, kept
+        return frames, Kept(kept, recorder.steps)
 
     def backward(
         self,
         values: Mapping[str, torch.Tensor],
         steps_done: int,
-        kept: Mapping[str, torch.Tensor],
+        kept: Kept,
         wanted: Sequence[str],
         losses: Mapping[str, torch.Tensor | None],
     ) -> list[torch.Tensor]:
@@ -102,12 +112,19 @@ class DeviceRun:
         self._upload(values, steps_done)
         adjoint = self._adjoint_of(wanted)
         adjoint.clear()
-        length = self.simulator.chunk
-        for first in reversed(range(0, self.steps, length)):
-            steps = min(length, self.steps - first)
-            self.checkpoints.bring_back(kept, first, steps, steps_done)
+        for first, steps in reversed(pieces(self.steps, self.simulator.chunk, kept.split)):
+            step = kept.split.get(first + 1)
+            if step is None:
+                before = kept.split.get(first)
+                start = None if before is None or first % self.simulator.chunk == 0 else before.end
+                self.checkpoints.bring_back(kept.states, first, steps, steps_done, start)
+                self._set_losses(losses, first, steps)
+                adjoint.backward_chunk(first, steps, steps_done)
+                continue
             self._set_losses(losses, first, steps)
-            adjoint.backward_chunk(first, steps, steps_done)
+            for k, part in reversed(list(enumerate(step.parts))):
+                step.put(self.simulator, k)
+                adjoint.backward_part(part.method, part.size, part.left, first + 1, steps_done)
         self._set_losses(losses, -1, 1, move=1)
         adjoint.finish()
         return [self._gradient(name, values[name], losses) for name in wanted]
@@ -125,17 +142,6 @@ class DeviceRun:
         # an interrupted run may have left these
         arrays.zero("status")
         simulator.integrator.set_times(simulator.step_size, simulator.step_size)
-
-    def _refuse_split_steps(self, steps_done: int) -> None:
-        """Raises a GradientError where a step was made in parts."""
-        for k, part in self.simulator.split_steps.items():
-            step = k - steps_done
-            raise GradientError(
-                f"step {step} could only be made in parts, the smallest {part:g} s, and has no gradient; "
-                f"try a smaller step than {self.simulator.step_size:g} s",
-                step=step,
-                term=None,
-            )
 
     def _adjoint_of(self, wanted: Sequence[str]) -> Adjoint:
         """Finds the adjoint for these inputs: the last one, or a new one, since a simulator has one at a time."""

@@ -39,12 +39,15 @@ class Parts:
         tried: size of the last part.
         made, rejected: parts made since the beginning, and those that were not good enough or could not be made.
         damped: parts that the fallback made.
+        watcher: called after every part that was made, with the method, the part's size and what was left of the step
+            before it, in steps. The state is at its end then, and ``kept_position`` and so on are its start.
     """
 
     def __init__(self, model: Model, method: Any, allowed: float | None, fallback: Callable[[], Any] | None = None):
         self.model, self.method, self.allowed = model, method, allowed
         self._make_fallback: Any = fallback
         self._fallback: Any = None
+        self.watcher: Callable[[Any, float, float], None] | None = None
         self.reset()
         self._graphs = Graphs(model.device)
 
@@ -73,17 +76,20 @@ class Parts:
             parts = max(1, math.ceil(left / self.size - 1e-9))
             size = self.tried = left / parts
             self._copy("kept_", "")
-            accepted = not gained and self._try(self.method, count, size, left)
+            method, accepted = self.method, not gained and self._try(self.method, count, size, left)
             if not accepted and self._is_to_damp(gained, least):
                 gained = False
                 self._restore()
                 accepted = self._damp(count, size, left, last=0.5 * size < least)
+                method = self._fallback
             if not accepted:
                 self.rejected += 1
                 if self.size < least:
                     return 0.0
                 self._restore()
                 continue
+            if self.watcher is not None:
+                self.watcher(method, size, left)
             self.made += 1
             smallest = min(smallest, size)
             done = 1.0 if parts == 1 else done + size
