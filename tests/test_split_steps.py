@@ -215,6 +215,23 @@ def test_a_second_backward_pass_and_a_copy_give_the_same() -> None:
     assert torch.equal(torch.autograd.grad(again, shear)[0], first)
 
 
+def test_steps_that_are_made_again_are_not_watched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What they may gain depends on what was there before them, which a run from their middle does not know."""
+    rollout = wt.Rollout(scene_for("plain", STEPS), STEPS, checkpoint_every=2)
+    shear = torch.tensor(900.0, dtype=torch.float64, requires_grad=True)
+    loss = (rollout(shear=shear).position / 1e-3).square().sum()
+    run_chunk, bounds = rollout.simulator.run_chunk, []
+
+    def looked_at(steps: int) -> int:
+        arrays = rollout.simulator.arrays
+        bounds.append((float(arrays["bounds"].numpy()[0]), int(arrays["audit_due"].numpy()[0])))
+        return run_chunk(steps)
+
+    monkeypatch.setattr(rollout.simulator, "run_chunk", looked_at)
+    loss.backward()
+    assert bounds == [(np.inf, 0)] * 2
+
+
 def test_a_step_that_cannot_be_made_again_says_so() -> None:
     """As on a device that does not add in the same order each time."""
     rollout = wt.Rollout(scene_for("plain", STEPS), STEPS, integrator="linear", checkpoint_every=2)
