@@ -215,6 +215,20 @@ def test_a_second_backward_pass_and_a_copy_give_the_same() -> None:
     assert torch.equal(torch.autograd.grad(again, shear)[0], first)
 
 
+@pytest.mark.slow
+def test_two_cores_take_parts_back_as_one_does() -> None:
+    fabric, gradients = cloth(4, 18), []
+    scene = wy.Scene(fabric, pins=fabric.corners("top"))
+    for threads in (1, 2):
+        rollout = wt.Rollout(scene, STEPS, checkpoint_every=3, threads=threads, **EXACT)
+        make_in_parts(rollout.simulator, {1: (GAINED, 0.6), 2: (STALLED, 0.6)})
+        gradients.append(gradients_of(rollout, jittered(fabric, size=0.2), {2, 3}))
+    assert rollout.simulator.model.strips == 2
+    for found, expected in zip(*reversed(gradients), strict=True):
+        # the same operations on every node; sums over nodes are added in another order
+        assert (found - expected).abs().max() < 1e-9 * expected.abs().max()
+
+
 def test_steps_that_are_made_again_are_not_watched_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """What they may gain depends on what was there before them, which a run from their middle does not know."""
     rollout = wt.Rollout(scene_for("plain", STEPS), STEPS, checkpoint_every=2)
