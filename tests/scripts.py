@@ -23,7 +23,7 @@ def load(path: str) -> ModuleType:
     sys.modules.pop("common", None)
     with mock.patch.object(sys, "path", [str(file.parent), *sys.path]):
         spec.loader.exec_module(module)
-    del sys.modules["common"]
+    sys.modules.pop("common", None)
     return module
 
 

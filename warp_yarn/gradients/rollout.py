@@ -14,9 +14,10 @@ import torch
 import warp as wp
 
 from ..description.scene import Scene
-from ..device.arrays import STATE_TYPES, YARN_PARAMETERS
+from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE, refuse_recording
 from ..errors import GradientError, InputError, choice, number, whole
+from ..kernels import TERMS, own, parameters
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 from .adjoint import Adjoint
@@ -42,20 +43,10 @@ class Frames(NamedTuple):
         return State(*(values[-1] for values in self))
 
 
-NUMBERS = (
-    "shear",
-    "friction",
-    "friction_stiffness",
-    "friction_damping",
-    "friction_sharpness",
-    "parallel_stiffness",
-    "wind_density",
-    "wind_drag",
-    "pin_stiffness",
-)
-VECTORS = ("gravity", "wind_velocity")
-ABOVE_0 = ("density", "friction_stiffness", "friction_sharpness", "pin_stiffness")
-"""Of the yarns' parameters and the numbers; the others are at least 0: the ranges of Yarn, Cloth, Wind and Scene."""
+_OWN = [parameter for term in TERMS.values() if own(term) for parameter in term.parameters]
+NUMBERS = tuple(p.name for p in _OWN if p.of == "scene" and p.size == 1)
+VECTORS = tuple(p.name for p in _OWN if p.size == 3)
+"""Names of inputs that are no yarn's, beside those of registered terms."""
 MOST_STEPS = 2**31 - 1
 """The device counts in 32 bits."""
 ARRAY_OF_PATH = {"pin_path": "pin_target", "forces": "applied_force"}
@@ -104,6 +95,9 @@ class Rollout:
         self._options = {**options, "device": str(self.simulator.model.device)}
         self.dtype = {"double": torch.float64, "single": torch.float32}[self.simulator.model.precision]
         self.device = wp.device_to_torch(self.simulator.model.device)
+        arrays = self.simulator.arrays
+        self._parameters = {name: p for name, p in parameters().items() if arrays.get(name) is not None}
+        self._of_yarns = tuple(name for name, p in self._parameters.items() if p.of == "yarn")
         self._defaults = self._scene_values()
         self._adjoint: Adjoint | None = None
 
@@ -120,9 +114,8 @@ class Rollout:
 
     def _scene_values(self) -> dict[str, torch.Tensor]:
         arrays = self.simulator.arrays
-        names = [*YARN_PARAMETERS, *NUMBERS, *VECTORS]
-        values = {name: arrays[name].numpy() for name in names if arrays.get(name) is not None}
-        values = {k: v.reshape(()) if k in NUMBERS else v.reshape(-1) for k, v in values.items()}
+        shapes = {name: (-1,) if p.of == "yarn" or p.size == 3 else () for name, p in self._parameters.items()}
+        values = {name: arrays[name].numpy().reshape(shape) for name, shape in shapes.items()}
         for name, array in ARRAY_OF_PATH.items():
             if f"{array}_path" in arrays:
                 path = arrays[f"{array}_path"].numpy().reshape(-1, len(arrays[array]), 3)
@@ -135,19 +128,20 @@ class Rollout:
 
     @property
     def defaults(self) -> dict[str, torch.Tensor]:
-        """The scene's own value of everything that an input can replace, density, stretch and bend by yarn; a copy."""
+        """The scene's own value of everything that an input can replace, the yarns' parameters by yarn; a copy."""
         return {name: value.clone() for name, value in self._defaults.items()}
 
     @property
     def inputs(self) -> dict[str, tuple[int, ...]]:
         """Everything that a call takes, and that a gradient can be asked for: name and shape.
 
-        density, stretch and bend are of each material; with ``yarn_`` before them, of each yarn, the warp yarns first.
+        density, stretch, bend and what registered terms have of each yarn are of each material; with ``yarn_`` before
+        them, of each yarn, the warp yarns first.
         pin_path and forces have the shapes that the scene gave them. Nodes on the border have no Eulerian coordinate:
         their rows of euler_velocity are taken for 0.
         """
         shapes = {name: tuple(value.shape) for name, value in self._defaults.items()}
-        for name in YARN_PARAMETERS:
+        for name in self._of_yarns:
             shapes[f"yarn_{name}"] = shapes[name]
             shapes[name] = (len(self.scene.cloth.yarns),)
         return shapes
@@ -182,7 +176,7 @@ class Rollout:
                 inputs[name] = getattr(state, name)
         values = {name: self._checked(name, value) for name, value in inputs.items()}
         material = torch.as_tensor(self.scene.cloth.material, device=self.device)
-        for name in YARN_PARAMETERS:
+        for name in self._of_yarns:
             if name in values and f"yarn_{name}" in values:
                 raise InputError(f"{name} and yarn_{name} are both given, must be one of them")
             if name in values:
@@ -208,7 +202,7 @@ class Rollout:
                 f"the inputs are {', '.join(sorted(shapes))}"
             )
         tensor = _real(name, value).to(device=self.device, dtype=self.dtype)
-        if name in NUMBERS and tensor.shape == (1,):
+        if shapes[name] == () and tensor.shape == (1,):
             tensor = tensor.reshape(())
         if tuple(tensor.shape) != shapes[name]:
             raise InputError(f"{name} has shape {tuple(tensor.shape)}, must be {shapes[name]}")
@@ -407,10 +401,8 @@ def _refuse_transforms(*tensors: torch.Tensor | None) -> None:
 
 def _range(name: str) -> dict[str, float]:
     """What ``number`` is to check of an input."""
-    name = name.removeprefix("yarn_")
-    if name not in (*YARN_PARAMETERS, *NUMBERS):
-        return {}
-    return {"above": 0.0} if name in ABOVE_0 else {"least": 0.0}
+    parameter = parameters().get(name.removeprefix("yarn_"))
+    return {} if parameter is None else parameter.range
 
 
 def _real(name: str, value: Any) -> torch.Tensor:
@@ -528,8 +520,11 @@ class Fabric(torch.nn.Module):
             self.set(name, initial.get(name, self._default(name)))
 
     def _default(self, name: str) -> torch.Tensor:
-        if name in YARN_PARAMETERS:
-            return torch.tensor([getattr(yarn, name) for yarn in self.rollout.scene.cloth.yarns], dtype=torch.float64)
+        scene = self.rollout.scene
+        if name in scene.registered and scene.registered[name].of == "yarn":
+            return torch.tensor(scene.registered_value(name))
+        if name in self.rollout._of_yarns:
+            return torch.tensor([getattr(yarn, name) for yarn in scene.cloth.yarns], dtype=torch.float64)
         return self.rollout.defaults[name.removeprefix("yarn_")]
 
     def value(self, name: str) -> torch.Tensor:
@@ -599,7 +594,7 @@ def _pair(name: str, pair: Any) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise InputError(f"learn[{name!r}] = {pair!r}, must be two numbers, (lowest, highest)") from error
     # every value in between is allowed where the lowest is, or is just not
-    least = 0.0 if _range(name) else None
+    least = next(iter(_range(name).values()), None)
     low, high = number(f"learn[{name!r}][0]", low, least=least), number(f"learn[{name!r}][1]", high)
     if not low < high:
         raise InputError(f"learn[{name!r}] = ({low:g}, {high:g}), the second must be above the first")
