@@ -16,7 +16,7 @@ import warp as wp
 from .description.scene import checked_parameter
 from .description.topology import Topology
 from .device.exclusive import ALONE
-from .errors import InputError, choice
+from .errors import InputError, choice, number, whole
 from .integrators import INTEGRATORS
 from .integrators.stage import StageMethod
 from .kernels import TERMS, Term, TermParameter, Variant, add, build, build_term, own, parameters, remove
@@ -27,6 +27,9 @@ STENCILS = (0, 2, 4, 6)
 SUMS_OF_ENERGY = ("", "elastic_energy", "height_energy")
 OTHER_INPUTS = ("sliding", "state", "steps_done", "forces", "pin_path")
 """What calls and ablations say beside the names of terms, parameters and arrays."""
+METHOD = ("name", "order", "fallback", "local_error", "set_times", "advance", "prepare_adjoint", "retreat")
+STAGES = ("fraction", "carried", "stages")
+"""What a method has, and a StageMethod as well."""
 _OWN_METHODS = frozenset(INTEGRATORS)
 
 
@@ -64,7 +67,14 @@ def register_term(term: Term) -> None:
         names = [parameter.name for parameter in term.parameters]
         if len(set(names)) < len(names):
             raise InputError(f"term.parameters names one twice: {', '.join(names)}")
-        for kernel in build_term(term, Variant(wp.float64, True)).values():
+        try:
+            own_kernels = build_term(term, Variant(wp.float64, True))
+        except NameError as error:
+            raise InputError(
+                f"term {term.name!r} cannot be defined ({error}): Warp reads the annotations of a kernel's arguments, "
+                "so its file must not have 'from __future__ import annotations'"
+            ) from error
+        for kernel in own_kernels.values():
             _check_kernel(term, kernel)
         add(term)
 
@@ -91,26 +101,27 @@ def register_integrator(method: type) -> None:
     """
     if not isinstance(method, type):
         raise InputError(f"method = {method!r}, must be a class, such as a StageMethod")
-    needed: tuple[str, ...] = (
-        "name",
-        "order",
-        "fallback",
-        "local_error",
-        "set_times",
-        "advance",
-        "prepare_adjoint",
-        "retreat",
-    )
-    if issubclass(method, StageMethod):
-        needed += ("fraction", "carried", "stages")
+    given: Any = method
+    of_stages = issubclass(method, StageMethod)
+    needed = (*METHOD, *(STAGES if of_stages else ()))
     for attribute in needed:
         if not hasattr(method, attribute):
             raise InputError(f"method {method.__name__} has no {attribute!r}, must have {', '.join(needed)}")
-    name: Any = method.name  # type: ignore[attr-defined]
+    name = given.name
     if not isinstance(name, str) or not name or name in INTEGRATORS:
         raise InputError(f"method.name = {name!r}, must be another one than {', '.join(INTEGRATORS)}")
-    if method.fallback is not None:  # type: ignore[attr-defined]
-        choice("method.fallback", method.fallback, INTEGRATORS)  # type: ignore[attr-defined]
+    if given.fallback is not None:
+        choice("method.fallback", given.fallback, INTEGRATORS)
+    if of_stages:
+        whole("method.stages", given.stages, least=1, most=2)
+        number("method.fraction", given.fraction, above=0.0)
+        # a single stage that ends the step covers it all; one that is carried is carried over all of it
+        covered = given.carried if given.stages == 1 and given.carried else given.fraction + given.carried
+        if abs(covered - 1.0) > 1e-12:
+            raise InputError(
+                f"method.fraction = {given.fraction:g} and carried = {given.carried:g} of {given.stages} stages cover "
+                f"{covered:g} of a step, must cover 1"
+            )
     with ALONE:
         INTEGRATORS[name] = method
 

@@ -12,7 +12,7 @@ import warp as wp
 from ..description.cloth import Cloth
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
-from ..errors import InputError, choice
+from ..errors import InputError
 from ..kernels import TERMS, Term, Variant, build
 from ..kernels.linear import multilevel
 from ..simulation.state import CLOTH_NUMBERS
@@ -32,7 +32,7 @@ class Arrays(dict[str, Any]):
     def __init__(self, scene: Scene, variant: Variant, device: Any):
         super().__init__()
         self.scene, self.variant, self.device = scene, variant, device
-        self.terms: list[Term] = [TERMS[choice("scene.terms", name, TERMS)] for name in scene.terms]
+        self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
         # Single precision far from 0 would lose the cloth itself: a kilometre away its unit is 60 µm. What is

@@ -19,7 +19,7 @@ import warp as wp
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, number, whole
-from ..kernels import Term, Variant, build
+from ..kernels import TERMS, Term, Variant, build
 from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
 from . import exclusive
 from .arrays import Arrays
@@ -130,6 +130,8 @@ class Model:
         except Exception as error:
             names = ", ".join(str(d) for d in wp.get_devices())
             raise InputError(f"device = {device!r}, must be one of {names}") from error
+        for name in scene.terms:  # one may have been registered when the scene was made
+            choice("scene.terms", name, TERMS)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant, scene.terms)
         self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
