@@ -27,7 +27,7 @@ from .terms import (
     wind,
 )
 
-__all__ = ["TERMS", "Term", "TermParameter", "Variant", "add", "build", "build_term", "own", "parameters", "remove"]
+__all__ = ["TERMS", "Term", "TermParameter", "Variant", "build", "build_term", "in_order", "own", "parameters"]
 
 _OWN = (
     inertia.MASS,
@@ -44,7 +44,7 @@ _OWN = (
     friction.TERM,  # last: it reads the sum of the others
 )
 TERMS: dict[str, Term] = {term.name: term for term in _OWN}
-"""Every term by its name, in the order of their launches."""
+"""Every term by its name, those that were registered last."""
 
 
 def own(term: Term) -> bool:
@@ -54,22 +54,18 @@ def own(term: Term) -> bool:
 
 def parameters() -> dict[str, TermParameter]:
     """Find the parameters of all terms, by name."""
-    return {parameter.name: parameter for term in TERMS.values() for parameter in term.parameters}
+    return {parameter.name: parameter for term in tuple(TERMS.values()) for parameter in term.parameters}
 
 
-def add(term: Term) -> None:
-    """Puts a checked term (``warp_yarn/registration.py``) in its place: what presses stands before what reads the
-    contact, and what reads the sum of forces last."""
-    terms = list(TERMS.values())
-    at = next(k for k, t in enumerate(terms) if t.reads_forces or (term.presses and t.needs_contact))
-    terms.insert(at, term)
-    TERMS.clear()
-    TERMS.update({term.name: term for term in terms})
-
-
-def remove(name: str) -> None:
-    """Takes a term out again."""
-    del TERMS[name]
+def in_order() -> dict[str, Term]:
+    """Every term by its name, in the order of their launches: one that was registered stands before friction, and where
+    it presses before all that reads the contact."""
+    terms = list(_OWN)
+    for term in tuple(TERMS.values()):
+        if not own(term):
+            after = (k for k, t in enumerate(terms) if t.reads_forces or (term.presses and t.needs_contact))
+            terms.insert(next(after), term)
+    return {term.name: term for term in terms}
 
 
 def build(variant: Variant, terms: tuple[str, ...] = ()) -> dict[str, wp.Kernel]:

@@ -19,7 +19,7 @@ import warp_yarn.learn as wl
 import warp_yarn.torch as wt
 from cases import joined, make_state
 from scripts import load
-from warp_yarn.kernels import TERMS
+from warp_yarn.kernels import TERMS, in_order
 from warp_yarn.kernels.core.indexing import coordinates, index
 
 import warp_yarn as wy
@@ -536,10 +536,49 @@ def test_a_term_reads_what_the_scene_lacks() -> None:
         wy.unregister_term("windy")
 
 
+@pytest.mark.parametrize("works", [True, False])
+def test_work_without_an_energy(works: bool) -> None:
+    """A term that pushes a free cloth: the watch over energy takes it for a gain unless the term says that it works."""
+
+    def define(variant: wy.Variant) -> wp.Kernel:
+        scalar, vec3 = variant.scalar, variant.vec3
+
+        @variant.kernel("terms")
+        def push_term(push: wp.array(dtype=scalar), force: wp.array(dtype=vec3)):
+            wp.atomic_add(force, wp.tid(), vec3(scalar(0.0), scalar(0.0), push[0]))
+
+        return push_term
+
+    push = wy.TermParameter("push", "N", default=1e-4)
+    wy.register_term(wy.Term("push", "nodes", define, parameters=(push,), works=works))
+    try:
+        c = fabric(pose="flat")
+        # named, with the default
+        scene = wy.Scene(c, gravity=None, terms=[*wy.Scene(c, gravity=None).terms, "push"])
+        simulator = wy.Simulator(scene)
+        if works:
+            lengths = np.array([4] * 4 + [3] * 5)
+            mass = sum(c.yarns[k].density * n for k, n in zip(c.material, lengths, strict=True)) * c.spacing
+            rise = simulator.run(20).position[-1] - c.position
+            segments = c.topology.segment_nodes
+            of_node = np.zeros(c.nodes)
+            for end in range(2):
+                shares = [c.yarns[c.material[k]].density for k in c.topology.segment_yarn]
+                np.add.at(of_node, segments[:, end], 0.5 * c.spacing * np.array(shares))
+            # the centre of mass, by F t²/2m; sliding moves mass along yarns by less than this
+            assert of_node @ rise[:, 2] / mass == pytest.approx(20e-4 * 0.02**2 / (2.0 * mass), rel=1e-3)
+            assert not simulator.damped_steps and not simulator.split_steps
+        else:
+            with pytest.raises(wy.SimulationError, match="gains energy"):
+                simulator.run(20)
+    finally:
+        wy.unregister_term("push")
+
+
 def test_what_presses_stands_before_the_contact() -> None:
     wy.register_term(dataclasses.replace(TETHER, presses=True))
     try:
-        names = list(TERMS)
+        names = list(in_order())
         assert names.index("tether") == names.index("shear") - 1
     finally:
         wy.unregister_term("tether")

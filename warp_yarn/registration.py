@@ -19,7 +19,7 @@ from .device.exclusive import ALONE
 from .errors import InputError, choice, number, whole
 from .integrators import INTEGRATORS
 from .integrators.stage import StageMethod
-from .kernels import TERMS, Term, TermParameter, Variant, add, build, build_term, own, parameters, remove
+from .kernels import TERMS, Term, TermParameter, Variant, build, build_term, own, parameters
 from .kernels.core.variant import ELEMENTS
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -76,7 +76,7 @@ def register_term(term: Term) -> None:
             ) from error
         for kernel in own_kernels.values():
             _check_kernel(term, kernel)
-        add(term)
+        TERMS[term.name] = term
 
 
 def unregister_term(name: str) -> None:
@@ -86,7 +86,7 @@ def unregister_term(name: str) -> None:
         InputError: no term of this name was registered.
     """
     with ALONE:
-        remove(choice("term", name, [known for known, term in TERMS.items() if not own(term)]))
+        del TERMS[choice("term", name, [known for known, term in TERMS.items() if not own(term)])]
 
 
 def register_integrator(method: type) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, indices, number
-from ..kernels import TERMS, Term, TermParameter, own, parameters
+from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
 from .cloth import Cloth, Fixed
 
 
@@ -182,15 +182,16 @@ class Scene(Fixed):
         if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
             raise InputError(f"terms = {names!r}, must be a list of names")
         names = None if names is None else tuple(names)
-        missing = {name: reason for name, term in TERMS.items() if (reason := self._lacks(term))}
+        known = in_order()
+        missing = {name: reason for name, term in known.items() if (reason := self._lacks(term))}
         if names is None:
-            given = {name for name, term in TERMS.items() if any(p.name in self._parameters for p in term.parameters)}
-            return tuple(name for name, term in TERMS.items() if name not in missing and (own(term) or name in given))
+            given = {name for name, term in known.items() if any(p.name in self._parameters for p in term.parameters)}
+            return tuple(name for name, term in known.items() if name not in missing and (own(term) or name in given))
         for name in names:
-            choice("terms", name, TERMS)
+            choice("terms", name, known)
             if name in missing:
                 raise InputError(f"terms names {name!r}, but {missing[name]}")
-        return tuple(name for name in TERMS if name in names or name == "mass")
+        return tuple(name for name in known if name in names or name == "mass")
 
     def _lacks(self, term: Term) -> str:
         """Why the scene has no use for a term, or ""."""
@@ -207,7 +208,7 @@ class Scene(Fixed):
             return {}
         if not isinstance(given, Mapping):
             raise InputError(f"parameters = {given!r}, must be a dictionary, {{name: value}}")
-        known = {p.name: p for term in TERMS.values() if not own(term) for p in term.parameters}
+        known = {p.name: p for term in in_order().values() if not own(term) for p in term.parameters}
         others, result = parameters(), {}
         for name, value in given.items():
             if name not in known and name in others:
