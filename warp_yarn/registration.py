@@ -49,6 +49,10 @@ def register_term(term: Term) -> None:
     """
     if not isinstance(term, Term):
         raise InputError(f"term = {term!r}, must be a Term")
+    try:
+        hash(term)
+    except TypeError as error:
+        raise InputError(f"term = {term!r}: its parameters and their defaults must be tuples ({error})") from error
     with ALONE:
         kernels = build(Variant(wp.float64, True))
         labels = {argument.label for kernel in kernels.values() for argument in kernel.adj.args}
