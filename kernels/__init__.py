@@ -82,21 +82,10 @@ def build(variant: Variant, terms: tuple[str, ...] = ()) -> dict[str, wp.Kernel]
     return kernels
 
 
-_named: dict[str, list[Term]] = {}
-"""Registered terms that kernels were built of, by name."""
-
-
 @functools.cache
 def build_term(term: Term, variant: Variant) -> dict[str, wp.Kernel]:
-    """The kernels of a term that is not the package's own, in modules of their own: see ``_build``.
-
-    One that comes after another one of its name has other modules, so that simulators of that go on.
-    """
-    of_name = _named.setdefault(term.name, [])
-    if term not in of_name:
-        of_name.append(term)
-    count = of_name.index(term)
-    variant = dataclasses.replace(variant, term=term.name + (f"_{count + 1}" if count else ""))
+    """The kernels of a term that is not the package's own, in modules of their own: see ``_build``."""
+    variant = dataclasses.replace(variant, term=term.name)
     variant.fuse("terms")
     kernels = {term.name: term.define(variant)}
     if term.energy is not None:

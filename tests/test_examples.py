@@ -162,8 +162,8 @@ def test_options_of_the_simulator(drag: ModuleType, options: dict[str, Any]) -> 
     scene = hung(parameters={"linear_drag": C})
     expected, found = (wy.Simulator(scene, **o).run(10).position[-1] for o in ({"newton_tolerance": 1e-8}, options))
     moved = np.abs(expected - scene.cloth.position).max()
-    # of single precision and of the default tolerance, 2e-2 of a step's change; the drag itself makes 5 %
-    assert np.abs(found - expected).max() < 1e-3 * moved
+    # smaller steps leave less of the step's own error, 3e-3; single precision and the default tolerance under 1e-3
+    assert np.abs(found - expected).max() < 5e-3 * moved
     without = wy.Simulator(hung(), newton_tolerance=1e-8).run(10).position[-1]
     assert np.abs(without - expected).max() > 2e-2 * moved
 
@@ -431,6 +431,7 @@ def test_another_term_of_the_name(tethered: wy.Scene) -> None:
     second = wy.Simulator(tethered)
     pull, push = first.forces(expected[3])["tether"][0], second.forces(expected[3])["tether"][0]
     assert np.abs(pull + push).max() < 1e-13 * np.abs(pull).max()
+    assert (first.forces(expected[3])["tether"][0] == pull).all()
     assert first.run(3).position == pytest.approx(expected.position[3:], abs=0.0)
 
 
