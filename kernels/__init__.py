@@ -1,14 +1,15 @@
 """What runs on the device, pure Warp, in five rooms that say themselves what belongs there and what they import.
 
-Installed as ``warp_yarn.kernels``. A new effect is a new file in ``terms`` with its ``TERM``, and one line here;
-``CONTRIBUTING.md`` has the rest.
+Installed as ``warp_yarn.kernels``. A new effect is a new file in ``terms`` with its ``TERM``, and one line here, or a
+file anywhere and ``wy.register_term``; ``CONTRIBUTING.md`` has the rest.
 """
 
+import dataclasses
 import functools
 
 import warp as wp
 
-from .core.variant import Term, Variant
+from .core.variant import Term, TermParameter, Variant
 from .linear import block_matrix, conjugate_gradient, incomplete_cholesky, multilevel
 from .nonlinear import newton
 from .stepping import energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
@@ -26,9 +27,9 @@ from .terms import (
     wind,
 )
 
-__all__ = ["TERMS", "Term", "Variant", "build"]
+__all__ = ["TERMS", "Term", "TermParameter", "Variant", "build", "build_term", "in_order", "own", "parameters"]
 
-_REGISTERED = (
+_OWN = (
     inertia.MASS,
     inertia.INERTIA,
     inertia.MASS_RATE,
@@ -42,12 +43,59 @@ _REGISTERED = (
     applied_force.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
-TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
+TERMS: dict[str, Term] = {term.name: term for term in _OWN}
+"""Every term by its name, those that were registered last."""
+
+
+def own(term: Term) -> bool:
+    """Whether a term is the package's own, and not one that was registered."""
+    return term in _OWN
+
+
+def parameters() -> dict[str, TermParameter]:
+    """Find the parameters of all terms, by name."""
+    return {parameter.name: parameter for term in tuple(TERMS.values()) for parameter in term.parameters}
+
+
+def in_order() -> dict[str, Term]:
+    """Every term by its name, in the order of their launches: one that was registered stands before friction, and where
+    it presses before all that reads the contact."""
+    terms = list(_OWN)
+    for term in tuple(TERMS.values()):
+        if not own(term):
+            after = (k for k, t in enumerate(terms) if t.reads_forces or (term.presses and t.needs_contact))
+            terms.insert(next(after), term)
+    return {term.name: term for term in terms}
+
+
+def build(variant: Variant, terms: tuple[str, ...] = ()) -> dict[str, wp.Kernel]:
+    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
+
+    Args:
+        variant: the variant.
+        terms: names of terms whose kernels are wanted too where they are not the package's own.
+    """
+    kernels = _build(variant)
+    for term in (TERMS[name] for name in terms):
+        if not own(term):
+            kernels = kernels | build_term(term, variant)
+    return kernels
 
 
 @functools.cache
-def build(variant: Variant) -> dict[str, wp.Kernel]:
-    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
+def build_term(term: Term, variant: Variant) -> dict[str, wp.Kernel]:
+    """The kernels of a term that is not the package's own, in modules of their own: see ``_build``."""
+    variant = dataclasses.replace(variant, term=term.name)
+    variant.fuse("terms")
+    kernels = {term.name: term.define(variant)}
+    if term.energy is not None:
+        kernels[f"{term.name}_energy"] = term.energy(variant.forward)
+    return kernels
+
+
+@functools.cache
+def _build(variant: Variant) -> dict[str, wp.Kernel]:
+    """The package's own kernels.
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
@@ -56,7 +104,7 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
     # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
     kernels = {"contact_normal": crossing_normal.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
-    for term in TERMS.values():
+    for term in _OWN:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)

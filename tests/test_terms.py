@@ -1,14 +1,17 @@
 """What holds of every term there is, of one that is added too."""
 
-import pytest
-from cases import Case
-from checks import matrix
-from warp_yarn.kernels import TERMS
+import dataclasses
 
-from warp_yarn.integrators.ros2 import EXPLICIT
+import pytest
+from cases import YARNS, Case, cloth, scene
+from checks import matrix
+from warp_yarn.kernels import TERMS, parameters
+
+import warp_yarn as wy
 
 KNOWN = ("friction",)
 """Terms whose damping the second solve of ROS2 has."""
+RANGES = [(name, end) for name, parameter in parameters().items() for end in parameter.range]
 
 
 @pytest.mark.parametrize("name", [name for name in TERMS if name != "mass"])
@@ -17,4 +20,47 @@ def test_ros2_knows_every_damping(name: str) -> None:
     would make it converge to another motion."""
     case = Case("plain", "random", True)
     damps = matrix(case.simulator(name), case.state, damping=1.0).any()
-    assert damps == (name in (*EXPLICIT, *KNOWN))
+    assert damps == (TERMS[name].explicit_in_ros2 or name in KNOWN)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_what_a_term_says_goes_together(name: str) -> None:
+    term = TERMS[name]
+    # the watch over energy has its work one way or the other
+    assert not (term.works and term.energy)
+    assert not term.energy_watched_as or term.energy
+    # an energy that is not watched is counted for 0, and so may not be less
+    if term.energy and not term.energy_watched_as:
+        for state in ("rest", "random", "stretched", "folded"):
+            case = Case("twill", state, True)
+            assert case.simulator(name).energy(case.state)[name] >= 0.0
+
+
+@pytest.mark.parametrize(("name", "end"), RANGES)
+def test_ranges_of_inputs_are_those_of_descriptions(name: str, end: str) -> None:
+    """What a gradient may be asked at is what Yarn, Cloth, Wind and Scene allow: the range is said twice."""
+
+    def described(value: float) -> object:
+        if parameters()[name].of == "yarn":
+            return dataclasses.replace(YARNS[0], **{name: value})
+        if name.startswith("wind_"):
+            return wy.Wind(velocity=(0.0, 0.0, 0.0), **{name.removeprefix("wind_"): value})
+        if name == "pin_stiffness":
+            return wy.Scene(cloth("plain"), pin_stiffness=value)
+        return cloth("plain").replace(**{name: value})
+
+    bound = parameters()[name].range[end]
+    described(bound + 1e-9)
+    with pytest.raises(wy.InputError, match=end.replace("least", "at least")):
+        described(bound - 1e-9 if end == "least" else bound)
+    if end == "least":
+        described(bound)
+
+
+def test_every_parameter_is_an_array() -> None:
+    """In a scene that has all terms."""
+    arrays = wy.Simulator(scene("plain", None), integrator="linear").arrays
+    for name, parameter in parameters().items():
+        of_yarns = parameter.of == "yarn"
+        assert arrays[name].shape == ((10,) if of_yarns else (1,))
+        assert arrays[name].numpy().size == parameter.size * len(arrays[name])

@@ -9,9 +9,13 @@ from .description.cloth import Cloth, Yarn
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
+from .integrators.stage import StageMethod
+from .integrators.tableau import sdirk
 from .io.published import Published, read_published
 from .io.usd import write_usd
+from .kernels import Term, TermParameter, Variant
 from .presets import fabrics, paper
+from .registration import register_integrator, register_term, unregister_integrator, unregister_term
 from .simulation.simulator import Simulator
 from .simulation.state import State, Trajectory
 from .view.render import write_mp4, write_png
@@ -29,8 +33,12 @@ __all__ = [
     "Scene",
     "SimulationError",
     "Simulator",
+    "StageMethod",
     "State",
+    "Term",
+    "TermParameter",
     "Trajectory",
+    "Variant",
     "WarpYarnError",
     "Weave",
     "Wind",
@@ -39,6 +47,11 @@ __all__ = [
     "fabrics",
     "paper",
     "read_published",
+    "register_integrator",
+    "register_term",
+    "sdirk",
+    "unregister_integrator",
+    "unregister_term",
     "write_mp4",
     "write_png",
     "write_usd",

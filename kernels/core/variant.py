@@ -2,8 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import warp as wp
+
+ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "pins", "applied")
+"""What a term's kernel may run over."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,6 +22,8 @@ class Variant:
     scalar: type
     sliding: bool
     reverse: bool = False
+    term: str = ""
+    """The term from outside the package whose kernels these are: they have modules of their own."""
 
     @property
     def forward(self) -> "Variant":
@@ -42,7 +48,8 @@ class Variant:
 
         One module a variant: typing.Any kernels would rebuild their module at every new instantiation.
         """
-        parts = ["warp_yarn", name, self.scalar.__name__, "sliding" if self.sliding else "locked"]
+        parts = ["warp_yarn", name, *([self.term] if self.term else [])]
+        parts += [self.scalar.__name__, "sliding" if self.sliding else "locked"]
         return "_".join(parts + ["reverse"] * self.reverse)
 
     def fuse(self, module: str) -> None:
@@ -58,6 +65,36 @@ class Variant:
 
 
 @dataclasses.dataclass(frozen=True)
+class TermParameter:
+    """A number, or a vector, that a term needs: an array of its name on the device, which runs have gradients by.
+
+    The parameters of the package's own terms are arguments of Yarn, Cloth, Wind and Scene, and so without a default
+    here. Those of terms that are registered come from ``Scene(parameters={name: value})``.
+    """
+
+    name: str
+    unit: str
+    """In SI, "" of what has none."""
+    default: float | tuple[float, float, float] | None = None
+    """What it is where a scene does not say; None: the scene has to."""
+    least: float | None = None
+    """The smallest value allowed."""
+    above: float | None = None
+    """What every value must be above."""
+    of: str = "scene"
+    """"scene": one number, ``name[0]`` in kernels, of the cloth as a whole too; "yarn": one of each material, and in
+    kernels of each yarn, ``name[segment_yarn[e]]``."""
+    size: int = 1
+    """3: a vector, of any values."""
+
+    @property
+    def range(self) -> dict[str, float]:
+        """What it must be above, or at least."""
+        ends = {"above": self.above, "least": self.least}
+        return {end: value for end, value in ends.items() if value is not None}
+
+
+@dataclasses.dataclass(frozen=True)
 class Term:
     """One physical effect, as the simulator sees it.
 
@@ -67,10 +104,14 @@ class Term:
 
     name: str
     elements: str
-    """What the kernel runs over: nodes, crossings, segments, bends, triangles or pins."""
+    """What the kernel runs over: one of ``ELEMENTS``."""
     define: Callable[[Variant], wp.Kernel]
     energy: Callable[[Variant], wp.Kernel] | None = None
     """The kernel that adds up the term's energy, where it has one."""
+    parameters: tuple[TermParameter, ...] = ()
+    """Those that no term before it has."""
+    absent: Callable[[Any], str] | None = None
+    """Says why a scene has no use for the term, or "" where it has. None: every scene has."""
     stencil: int = 0
     """Neighbours that the term couples in the matrix: 0 none, 2 the next crossings of each yarn, 4 the second
     next as well, 6 the diagonal ones as well."""
@@ -81,3 +122,16 @@ class Term:
     presses: bool = False
     """Whether the term presses yarns together (eq. 3): its kernel then adds to ``contact_load`` where ``press`` is not
     0. Such terms stand before those that need the contact."""
+    reads_forces: bool = False
+    """Whether the term reads the sum of the others' forces: it then stands last."""
+    energy_watched_as: str = ""
+    """The sum that the energy is added to at every step (``kernels/stepping/energy_watch.py``): "elastic_energy" of
+    what is strained, "height_energy" of what may be negative, as a weight's. "": its energy is looked at now and then,
+    and counts for 0 between, so it must be at least 0."""
+    works: bool = False
+    """Whether the term does work on the cloth and has no energy, as wind does. What can only brake need not say so."""
+    explicit_in_ros2: bool = False
+    """Whether ROS2 leaves the term out of its matrix. One that adds a damping D, ``weights[0][1]``, has to be: the
+    second solve of ROS2 knows no D but friction's."""
+    kept: bool = False
+    """Whether an ablation never leaves the term out, as it is what is done to the cloth."""

@@ -24,4 +24,11 @@ def define(variant: Variant) -> wp.Kernel:
     return applied_term
 
 
-TERM = Term(name="applied", elements="applied", define=define)
+TERM = Term(
+    name="applied",
+    elements="applied",
+    define=define,
+    absent=lambda scene: "" if len(scene.force_nodes) else "forces is empty",
+    works=True,
+    kept=True,
+)

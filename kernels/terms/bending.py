@@ -23,7 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 from . import mollifier
 
 FLAT = math.pi**2
@@ -282,4 +282,12 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return bending_energy
 
 
-TERM = Term(name="bending", elements="bends", define=define, energy=define_energy, stencil=4, presses=True)
+TERM = Term(
+    name="bending",
+    elements="bends",
+    define=define,
+    energy=define_energy,
+    parameters=(TermParameter("bend", "Pa m²", least=0.0, of="yarn"),),
+    stencil=4,
+    presses=True,
+)

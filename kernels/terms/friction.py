@@ -24,7 +24,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 
 FLOOR = 1.0e-7
 """Displacement, in spacings, whose spring force is the floor under μF_n: 1e-10 m for the paper's cloth,
@@ -194,6 +194,13 @@ TERM = Term(
     elements="crossings",
     define=define,
     energy=define_energy,
+    parameters=(
+        TermParameter("friction", "", least=0.0),
+        TermParameter("friction_stiffness", "N/m", above=0.0),
+        TermParameter("friction_damping", "N s/m", least=0.0),
+        TermParameter("friction_sharpness", "", above=0.0),
+    ),
     needs_contact=True,
     sliding_only=True,
+    reads_forces=True,
 )

@@ -11,7 +11,7 @@ nothing of it.
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
@@ -74,4 +74,12 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return gravity_energy
 
 
-TERM = Term(name="gravity", elements="segments", define=define, energy=define_energy)
+TERM = Term(
+    name="gravity",
+    elements="segments",
+    define=define,
+    energy=define_energy,
+    parameters=(TermParameter("gravity", "m/s²", size=3),),
+    absent=lambda scene: "gravity is None" if scene.gravity is None else "",
+    energy_watched_as="height_energy",
+)

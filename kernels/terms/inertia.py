@@ -14,7 +14,7 @@ two vanish where yarns do not slide. Their derivatives are not symmetric, and ar
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 
 
 def define_mass(variant: Variant) -> wp.Kernel:
@@ -217,6 +217,15 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return kinetic_energy
 
 
-MASS = Term(name="mass", elements="segments", define=define_mass, energy=define_energy, stencil=2)
+MASS = Term(
+    name="mass",
+    elements="segments",
+    define=define_mass,
+    energy=define_energy,
+    parameters=(TermParameter("density", "kg/m", above=0.0, of="yarn"),),
+    stencil=2,
+    energy_watched_as="energy",
+    kept=True,
+)
 INERTIA = Term(name="inertia", elements="segments", define=define_inertia, sliding_only=True)
 MASS_RATE = Term(name="mass_rate", elements="segments", define=define_mass_rate, sliding_only=True)

@@ -22,7 +22,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 from . import stretch as stretching
 
 BARRIER = 0.2
@@ -143,4 +143,12 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return parallel_energy
 
 
-TERM = Term(name="parallel", elements="segments", define=define, energy=define_energy, stencil=2, sliding_only=True)
+TERM = Term(
+    name="parallel",
+    elements="segments",
+    define=define,
+    energy=define_energy,
+    parameters=(TermParameter("parallel_stiffness", "N/m", least=0.0),),
+    stencil=2,
+    sliding_only=True,
+)

@@ -9,7 +9,7 @@ nodes out of the system (``kernels/stepping/linear.py``).
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
@@ -53,4 +53,15 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return pin_energy
 
 
-TERM = Term(name="pins", elements="pins", define=define, energy=define_energy)
+TERM = Term(
+    name="pins",
+    elements="pins",
+    define=define,
+    energy=define_energy,
+    parameters=(TermParameter("pin_stiffness", "N/m", above=0.0),),
+    absent=lambda scene: (
+        "" if len(scene.pins) and scene.pin_stiffness is not None else "there is no pin with a stiffness"
+    ),
+    energy_watched_as="elastic_energy",
+    kept=True,
+)

@@ -23,7 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 from . import mollifier
 
 OF_CURVATURE = 0.8
@@ -324,4 +324,12 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return shear_energy
 
 
-TERM = Term(name="shear", elements="crossings", define=define, energy=define_energy, stencil=6, needs_contact=True)
+TERM = Term(
+    name="shear",
+    elements="crossings",
+    define=define,
+    energy=define_energy,
+    parameters=(TermParameter("shear", "Pa", least=0.0),),
+    stencil=6,
+    needs_contact=True,
+)

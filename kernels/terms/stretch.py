@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 
 
 @functools.cache
@@ -145,4 +145,13 @@ def define_energy(variant: Variant) -> wp.Kernel:
     return stretch_energy
 
 
-TERM = Term(name="stretch", elements="segments", define=define, energy=define_energy, stencil=2, presses=True)
+TERM = Term(
+    name="stretch",
+    elements="segments",
+    define=define,
+    energy=define_energy,
+    parameters=(TermParameter("stretch", "Pa", least=0.0, of="yarn"),),
+    stencil=2,
+    presses=True,
+    energy_watched_as="elastic_energy",
+)

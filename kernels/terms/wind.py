@@ -13,7 +13,7 @@ The matrix holds the exact derivative by velocity, which is symmetric positive s
 import warp as wp
 
 from ..core.indexing import index
-from ..core.variant import Term, Variant
+from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
@@ -76,4 +76,17 @@ def define(variant: Variant) -> wp.Kernel:
     return wind_term
 
 
-TERM = Term(name="wind", elements="triangles", define=define, stencil=6)
+TERM = Term(
+    name="wind",
+    elements="triangles",
+    define=define,
+    parameters=(
+        TermParameter("wind_velocity", "m/s", size=3),
+        TermParameter("wind_density", "kg/m³", least=0.0),
+        TermParameter("wind_drag", "kg/(m² s)", least=0.0),
+    ),
+    absent=lambda scene: "wind is None" if scene.wind is None else "",
+    stencil=6,
+    works=True,
+    explicit_in_ros2=True,
+)

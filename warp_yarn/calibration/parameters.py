@@ -29,7 +29,8 @@ class Parameter:
 
     Args:
         name: "density[k]", "stretch[k]", "bend[k]" of material k; a number of the cloth, such as "shear" or "friction";
-            "wind_velocity[k]", "wind_density", "wind_drag", "gravity[k]" or "pin_stiffness", where the scene has them.
+            "wind_velocity[k]", "wind_density", "wind_drag", "gravity[k]" or "pin_stiffness", where the scene has them;
+            a parameter of a registered term of the scene, with an index where it is a vector or the yarns'.
         low, high: the range, its ends included; low below high.
         start: where learning begins, in the range.
     """
@@ -78,6 +79,8 @@ def learnable(scene: Scene) -> dict[str, int | None]:
         result["gravity"] = 3
     if len(scene.pins) and scene.pin_stiffness is not None:
         result["pin_stiffness"] = None
+    for name, parameter in scene.registered.items():
+        result[name] = len(scene.cloth.yarns) if parameter.of == "yarn" else 3 if parameter.size == 3 else None
     return result
 
 
@@ -96,6 +99,8 @@ def value_of(scene: Scene, name: str) -> float:
         return float(getattr(scene.cloth.yarns[k], base))
     if base in OF_CLOTHS:
         return float(getattr(scene.cloth, base))
+    if base in scene.registered:
+        return float(scene.registered_value(base)[() if k is None else k])
     value = getattr(scene.wind, OF_WINDS[base]) if base in OF_WINDS else getattr(scene, base)
     return float(value if k is None else value[k])
 
@@ -125,6 +130,13 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
         changes["gravity"] = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
     if ("pin_stiffness", None) in parts:
         changes["pin_stiffness"] = parts["pin_stiffness", None]
+    changes["parameters"] = scene.parameters
+    for (name, k), value in parts.items():
+        if name in scene.registered:
+            changed = np.array(changes["parameters"].get(name, scene.registered_value(name)))
+            changed = np.broadcast_to(changed, scene.registered_value(name).shape).copy()
+            changed[() if k is None else k] = value
+            changes["parameters"][name] = changed.item() if k is None else changed
     return scene.replace(**changes)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, indices, number
-from ..kernels import TERMS
+from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
 from .cloth import Cloth, Fixed
 
 
@@ -52,8 +52,11 @@ class Scene(Fixed):
             given by 3 numbers does not end.
         sliding: whether yarns slide along each other. Without, nodes have 3 degrees of freedom, (u, v) stays at rest,
             and friction, parallel yarns, inertia and mass rate have no part.
-        terms: the terms to model, by name; None: all that the scene has a use for. ``mass`` is always there.
+        terms: the terms to model, by name; None: all that the scene has a use for, and of those that were registered
+            (``wy.register_term``) the ones that ``parameters`` names a parameter of. ``mass`` is always there.
         published_scaling: take the arguments of eq. 4's tanh in SI units, as published, instead of dimensionless.
+        parameters: of registered terms: {name: value}, in the unit and range that the term gives them. One of the yarns
+            takes a number for all materials, or one for each; a vector 3 numbers. What is left out has its default.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class Scene(Fixed):
         sliding: bool = True,
         terms: Sequence[str] | None = None,
         published_scaling: bool = False,
+        parameters: Mapping[str, Any] | None = None,
     ):
         if not isinstance(cloth, Cloth):
             raise InputError(f"cloth = {cloth!r}, must be a Cloth")
@@ -87,6 +91,7 @@ class Scene(Fixed):
         self.force_path = self._force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
+        self._parameters = self._checked_parameters(parameters)
         self.terms = self._terms(terms)
         self._fix(
             cloth=cloth,
@@ -99,10 +104,28 @@ class Scene(Fixed):
             sliding=self.sliding,
             terms=None if terms is None else self.terms,
             published_scaling=self.published_scaling,
+            parameters=self._parameters,
         )
 
     def __repr__(self) -> str:
         return f"Scene({self.cloth}, terms {', '.join(self.terms)}, sliding {self.sliding})"
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters of registered terms that were given, the argument that would give these; a copy."""
+        return dict(self._parameters)
+
+    @property
+    def registered(self) -> dict[str, TermParameter]:
+        """The parameters of the scene's registered terms, by name."""
+        terms = (TERMS[name] for name in self.terms if name in TERMS)
+        return {parameter.name: parameter for term in terms if not own(term) for parameter in term.parameters}
+
+    def registered_value(self, name: str) -> np.ndarray:
+        """The value of one of ``registered``, given or by default: (), a vector (3), or of every material [yarns]."""
+        parameter = self.registered[name]
+        value = np.array(self._parameters.get(name, parameter.default), dtype=np.float64)
+        return np.broadcast_to(value, (len(self.cloth.yarns),)) if parameter.of == "yarn" else value
 
     @property
     def forces(self) -> dict[int, np.ndarray]:
@@ -121,7 +144,7 @@ class Scene(Fixed):
             arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
             return [missing if array is None else array for array in arrays]
 
-        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling")
+        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling", "parameters")
         return (
             self.cloth.same_as(other.cloth)
             and all(getattr(self, name) == getattr(other, name) for name in names)
@@ -159,20 +182,52 @@ class Scene(Fixed):
         if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
             raise InputError(f"terms = {names!r}, must be a list of names")
         names = None if names is None else tuple(names)
-        useless = {name: "yarns do not slide (sliding=False)" for name, t in TERMS.items() if t.sliding_only}
-        missing = {} if self.sliding else useless
-        if self.gravity is None:
-            missing["gravity"] = "gravity is None"
-        if self.wind is None:
-            missing["wind"] = "wind is None"
-        if not len(self.pins) or self.pin_stiffness is None:
-            missing["pins"] = "there is no pin with a stiffness"
-        if not len(self.force_nodes):
-            missing["applied"] = "forces is empty"
+        known = in_order()
+        missing = {name: reason for name, term in known.items() if (reason := self._lacks(term))}
         if names is None:
-            return tuple(name for name in TERMS if name not in missing)
+            given = {name for name, term in known.items() if any(p.name in self._parameters for p in term.parameters)}
+            return tuple(name for name, term in known.items() if name not in missing and (own(term) or name in given))
         for name in names:
-            choice("terms", name, TERMS)
+            choice("terms", name, known)
             if name in missing:
                 raise InputError(f"terms names {name!r}, but {missing[name]}")
-        return tuple(name for name in TERMS if name in names or name == "mass")
+        return tuple(name for name in known if name in names or name == "mass")
+
+    def _lacks(self, term: Term) -> str:
+        """Why the scene has no use for a term, or ""."""
+        if term.sliding_only and not self.sliding:
+            return "yarns do not slide (sliding=False)"
+        for parameter in () if own(term) else term.parameters:
+            if parameter.default is None and parameter.name not in self._parameters:
+                return f"parameters has no {parameter.name!r}"
+        return term.absent(self) if term.absent is not None else ""
+
+    def _checked_parameters(self, given: Any) -> dict[str, Any]:
+        """{name: value}, as ``checked_parameter`` leaves it."""
+        if given is None:
+            return {}
+        if not isinstance(given, Mapping):
+            raise InputError(f"parameters = {given!r}, must be a dictionary, {{name: value}}")
+        known = {p.name: p for term in in_order().values() if not own(term) for p in term.parameters}
+        others, result = parameters(), {}
+        for name, value in given.items():
+            if name not in known and name in others:
+                raise InputError(
+                    f"parameters names {name!r}, must be given to Yarn, Cloth, Wind or Scene by its argument"
+                )
+            if name not in known:
+                raise InputError(
+                    f"parameters names {name!r}, must be of a registered term: {', '.join(known) or 'there is none'}"
+                )
+            result[name] = checked_parameter(known[name], value, len(self.cloth.yarns))
+        return result
+
+
+def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> Any:
+    """A value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
+    if parameter.size == 3:
+        return tuple(finite_array(parameter.name, value, (3,)).tolist())
+    if parameter.of == "yarn" and not np.isscalar(value):
+        values = finite_array(parameter.name, value, (materials,)).tolist()
+        return tuple(number(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
+    return number(parameter.name, value, **parameter.range)

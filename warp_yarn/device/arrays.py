@@ -12,6 +12,7 @@ import warp as wp
 from ..description.cloth import Cloth
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
+from ..errors import InputError
 from ..kernels import TERMS, Term, Variant, build
 from ..kernels.linear import multilevel
 from ..simulation.state import CLOTH_NUMBERS
@@ -53,6 +54,9 @@ class Arrays(dict[str, Any]):
             "applied": len(scene.force_nodes),
         }
 
+    def __missing__(self, name: str) -> None:
+        raise InputError(f"no array of this scene is called {name!r}, of which a kernel has an argument")
+
     def zeros(self, count: int, dtype: Any) -> wp.array:
         return wp.zeros(count, dtype=dtype, device=self.device)
 
@@ -64,9 +68,9 @@ class Arrays(dict[str, Any]):
 
     def _topology(self, cloth: Cloth) -> None:
         topology = cloth.topology
-        used = {term.name for term in self.terms}
-        skipped = {"shear": "corner_", "wind": "triangle_"}
-        skipped = tuple(prefix for term, prefix in skipped.items() if term not in used)
+        kernels = build(self.variant, self.scene.terms)
+        names = {name for term in self.terms for name in (term.name, f"{term.name}_energy")}
+        read = {argument.label for name in names & set(kernels) for argument in kernels[name].adj.args}
         vectors = {1: wp.int32, 2: wp.vec2i, 3: wp.vec3i, 4: wp.vec4i}
         for name, values in vars(topology).items():
             if name == "neighbour":
@@ -76,7 +80,9 @@ class Arrays(dict[str, Any]):
             dtype = vectors[1 if values.ndim == 1 else values.shape[1]]
             # on the CPU the same memory: nothing writes to either
             shared = {"dtype": dtype, "device": self.device, "copy": False}
-            self[name] = None if name.startswith(skipped) else wp.array(values, **shared)
+            # the largest, which no kernel reads but those of terms
+            skipped = name.startswith(("corner_", "triangle_")) and name not in read
+            self[name] = None if skipped else wp.array(values, **shared)
         free = np.ones(topology.nodes, dtype=np.int32)
         if self.scene.pin_stiffness is None:
             free[self.scene.pins] = 0
@@ -112,6 +118,9 @@ class Arrays(dict[str, Any]):
             if len(scene.force_path) > 1:
                 self["applied_force_path"] = self.numbers(scene.force_path.reshape(-1, 3))
         self["published_scaling"] = int(scene.published_scaling)
+        for name, parameter in scene.registered.items():
+            value = scene.registered_value(name)
+            self[name] = self.numbers(value[cloth.material] if parameter.of == "yarn" else value[None])
 
     def _state(self) -> None:
         n, scalar, vec3 = self["nodes"], self.variant.scalar, self.variant.vec3

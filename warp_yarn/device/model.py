@@ -19,7 +19,7 @@ import warp as wp
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, number, whole
-from ..kernels import Term, Variant, build
+from ..kernels import TERMS, Term, Variant, build
 from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
 from . import exclusive
 from .arrays import Arrays
@@ -34,12 +34,6 @@ AT_END, AT_START = 2, 3
 """The places of a step's end and start among ``stage_times``, behind those of two stages."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
-CHEAP_ENERGIES = {
-    "mass": "energy", "stretch": "elastic_energy", "pins": "elastic_energy", "gravity": "height_energy",
-}  # fmt: skip
-"""Terms whose energy is looked at in every step, and the array that it goes to."""
-OUTER_FORCES = ("wind", "applied")
-"""Terms that do work on the cloth and have no energy."""
 NARROWEST_STRIP = 8
 """Columns; the sweeps need 3 at least, and fewer than these do not pay."""
 SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
@@ -136,8 +130,10 @@ class Model:
         except Exception as error:
             names = ", ".join(str(d) for d in wp.get_devices())
             raise InputError(f"device = {device!r}, must be one of {names}") from error
+        for name in scene.terms:  # one may have been registered when the scene was made
+            choice("scene.terms", name, TERMS)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
-        self.kernels = build(variant)
+        self.kernels = build(variant, scene.terms)
         self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
         self.arrays = Arrays(scene, variant, self.device)
         self.set_times(self.step_size, self.step_size, self.step_size)
@@ -445,10 +441,10 @@ class Model:
         self.launch("audit", 1)
 
     def _add_energies(self, *, cheap: bool) -> None:
-        """Energy of the cheap terms, or of the others."""
+        """Energy of the terms that are watched at every step, or of the others."""
         for term in self.arrays.terms:
-            if term.energy is not None and (term.name in CHEAP_ENERGIES) == cheap:
-                energy = self.arrays[CHEAP_ENERGIES.get(term.name, "energy")]
+            if term.energy is not None and bool(term.energy_watched_as) == cheap:
+                energy = self.arrays[term.energy_watched_as or "energy"]
                 self.launch(f"{term.name}_energy", term.elements, energy=energy)
 
     def begin_work(self) -> None:
@@ -464,7 +460,7 @@ class Model:
     @property
     def _outer(self) -> list[Term]:
         """Terms that do work on the cloth and have no energy."""
-        return [term for term in self.arrays.terms if term.name in OUTER_FORCES]
+        return [term for term in self.arrays.terms if term.works]
 
     def _add_outer_forces(self, target: str) -> None:
         """Fills an array with outer forces at the present state."""

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from ..description.scene import Scene
-from ..device.arrays import YARN_PARAMETERS
 from ..errors import InputError, choice, number
 from .inputs import allowed_range, real_tensor
 from .rollout import Frames, Rollout
@@ -56,8 +55,11 @@ class Fabric(torch.nn.Module):
 
     def _default(self, name: str) -> torch.Tensor:
         """Looks up the scene's own value."""
-        if name in YARN_PARAMETERS:
-            return torch.tensor([getattr(yarn, name) for yarn in self.rollout.scene.cloth.yarns], dtype=torch.float64)
+        scene = self.rollout.scene
+        if name in scene.registered and scene.registered[name].of == "yarn":
+            return torch.tensor(scene.registered_value(name))
+        if name in self.rollout.of_yarns:
+            return torch.tensor([getattr(yarn, name) for yarn in scene.cloth.yarns], dtype=torch.float64)
         return self.rollout.defaults[name.removeprefix("yarn_")]
 
     def value(self, name: str) -> torch.Tensor:
@@ -129,7 +131,7 @@ def _pair(name: str, pair: Any) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise InputError(f"learn[{name!r}] = {pair!r}, must be two numbers, (lowest, highest)") from error
     # every value in between is allowed where the lowest is, or is just not
-    least = 0.0 if allowed_range(name) else None
+    least = next(iter(allowed_range(name).values()), None)
     low, high = number(f"learn[{name!r}][0]", low, least=least), number(f"learn[{name!r}][1]", high)
     if not low < high:
         raise InputError(f"learn[{name!r}] = ({low:g}, {high:g}), the second must be above the first")

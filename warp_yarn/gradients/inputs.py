@@ -9,25 +9,15 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..device.arrays import YARN_PARAMETERS
 from ..errors import InputError, number
+from ..kernels import TERMS, own, parameters
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 
-NUMBERS = (
-    "shear",
-    "friction",
-    "friction_stiffness",
-    "friction_damping",
-    "friction_sharpness",
-    "parallel_stiffness",
-    "wind_density",
-    "wind_drag",
-    "pin_stiffness",
-)
-VECTORS = ("gravity", "wind_velocity")
-ABOVE_0 = ("density", "friction_stiffness", "friction_sharpness", "pin_stiffness")
-"""Of the yarns' parameters and the numbers; the others are at least 0: the ranges of Yarn, Cloth, Wind and Scene."""
+_OWN = [parameter for term in TERMS.values() if own(term) for parameter in term.parameters]
+NUMBERS = tuple(p.name for p in _OWN if p.of == "scene" and p.size == 1)
+VECTORS = tuple(p.name for p in _OWN if p.size == 3)
+"""Names of inputs that are no yarn's, beside those of registered terms."""
 ARRAY_OF_PATH = {"pin_path": "pin_target", "forces": "applied_force"}
 """Inputs that may change from step to step, and the arrays that hold a step's row of them."""
 
@@ -40,26 +30,29 @@ class Inputs:
 
     Attributes:
         dtype, device: of the tensors.
-        defaults: the scene's own value of everything, density, stretch and bend by yarn.
-        shapes: name and shape of everything that a call takes, density, stretch and bend by material too.
+        of_yarns: names of the parameters that yarns have.
+        defaults: the scene's own value of everything, the yarns' parameters by yarn.
+        shapes: name and shape of everything that a call takes, the yarns' parameters by material too.
     """
 
     def __init__(self, simulator: Simulator):
         self.cloth = simulator.scene.cloth
         self.dtype = {"double": torch.float64, "single": torch.float32}[simulator.model.precision]
         self.device = wp.device_to_torch(simulator.model.device)
+        arrays = simulator.arrays
+        self._parameters = {name: p for name, p in parameters().items() if arrays.get(name) is not None}
+        self.of_yarns = tuple(name for name, p in self._parameters.items() if p.of == "yarn")
         self.defaults = self._scene_values(simulator)
         self.shapes = {name: tuple(value.shape) for name, value in self.defaults.items()}
-        for name in YARN_PARAMETERS:
+        for name in self.of_yarns:
             self.shapes[f"yarn_{name}"] = self.shapes[name]
             self.shapes[name] = (len(self.cloth.yarns),)
 
     def _scene_values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Reads the scene's own values from the device."""
         arrays = simulator.arrays
-        names = [*YARN_PARAMETERS, *NUMBERS, *VECTORS]
-        values = {name: arrays[name].numpy() for name in names if arrays.get(name) is not None}
-        values = {k: v.reshape(()) if k in NUMBERS else v.reshape(-1) for k, v in values.items()}
+        shapes = {name: (-1,) if p.of == "yarn" or p.size == 3 else () for name, p in self._parameters.items()}
+        values = {name: arrays[name].numpy().reshape(shape) for name, shape in shapes.items()}
         for name, array in ARRAY_OF_PATH.items():
             if f"{array}_path" in arrays:
                 path = arrays[f"{array}_path"].numpy().reshape(-1, len(arrays[array]), 3)
@@ -86,7 +79,7 @@ class Inputs:
                 inputs[name] = getattr(state, name)
         values = {name: self.checked(name, value) for name, value in inputs.items()}
         material = torch.as_tensor(self.cloth.material, device=self.device)
-        for name in YARN_PARAMETERS:
+        for name in self.of_yarns:
             if name in values and f"yarn_{name}" in values:
                 raise InputError(f"{name} and yarn_{name} are both given, must be one of them")
             if name in values:
@@ -113,7 +106,7 @@ class Inputs:
                 f"the inputs are {', '.join(sorted(self.shapes))}"
             )
         tensor = real_tensor(name, value).to(device=self.device, dtype=self.dtype)
-        if name in NUMBERS and tensor.shape == (1,):
+        if self.shapes[name] == () and tensor.shape == (1,):
             tensor = tensor.reshape(())
         if tuple(tensor.shape) != self.shapes[name]:
             raise InputError(f"{name} has shape {tuple(tensor.shape)}, must be {self.shapes[name]}")
@@ -134,10 +127,8 @@ def array_of(name: str, value: torch.Tensor) -> str:
 
 def allowed_range(name: str) -> dict[str, float]:
     """Says what ``number`` is to check of an input."""
-    name = name.removeprefix("yarn_")
-    if name not in (*YARN_PARAMETERS, *NUMBERS):
-        return {}
-    return {"above": 0.0} if name in ABOVE_0 else {"least": 0.0}
+    parameter = parameters().get(name.removeprefix("yarn_"))
+    return {} if parameter is None else parameter.range
 
 
 def real_tensor(name: str, value: Any) -> torch.Tensor:

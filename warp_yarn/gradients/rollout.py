@@ -98,6 +98,7 @@ class Rollout:
         self._options = {**options, "device": str(self.simulator.model.device)}
         self._inputs = Inputs(self.simulator)
         self.dtype, self.device = self._inputs.dtype, self._inputs.device
+        self.of_yarns = self._inputs.of_yarns
         self._run = DeviceRun(self.simulator, self._inputs, self.steps, self.frames, self.checkpoint_every)
 
     def __getstate__(self) -> dict[str, Any]:

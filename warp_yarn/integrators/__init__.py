@@ -4,11 +4,15 @@ A method is a class that says its ``name``, ``order`` and, in its docstring, its
 the model's state arrays; ``prepare_adjoint`` and ``retreat`` are its reverse (``linear.py`` says what they leave).
 """
 
+from typing import Any
+
 from .implicit_euler import ImplicitEuler
 from .implicit_midpoint import ImplicitMidpoint
 from .linear import LinearlyImplicitEuler
 from .ros2 import ROS2
 from .sdirk2 import SDIRK2
 
-INTEGRATORS = {method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, ImplicitMidpoint, SDIRK2, ROS2)}
+INTEGRATORS: dict[str, Any] = {
+    method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, ImplicitMidpoint, SDIRK2, ROS2)
+}
 """Every method by its name."""

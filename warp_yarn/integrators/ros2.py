@@ -10,9 +10,6 @@ from ..device.model import BETWEEN, MATRIX, Model
 from ..kernels.stepping.ros2 import GAMMA
 from .linear import LinearlyImplicitEuler
 
-EXPLICIT = ("wind",)
-"""Terms that are left out of the matrix."""
-
 
 class ROS2(LinearlyImplicitEuler):
     """Two linear solves a step, each as that of eq. 2 with η = γ h, γ = 1 − 1/√2, in place of h.
@@ -51,6 +48,7 @@ class ROS2(LinearlyImplicitEuler):
             a[name] = a.zeros(a["nodes"], a.variant.vec3)
             a[f"euler_{name}"] = a.zeros(2 * a["nodes"], a.variant.scalar) if model.scene.sliding else None
         a["stage_size"] = a.zeros(1, a.variant.scalar)
+        self._explicit = tuple(term.name for term in a.terms if term.explicit_in_ros2)
         self.set_times(model.step_size, model.step_size)
 
     def set_times(self, step: float, remaining: float) -> None:
@@ -79,12 +77,12 @@ class ROS2(LinearlyImplicitEuler):
         model.end_step()
 
     def _assemble_first(self) -> None:
-        self.model.assemble(explicit=EXPLICIT, step_size=self.model.arrays["stage_size"])
+        self.model.assemble(explicit=self._explicit, step_size=self.model.arrays["stage_size"])
 
     def _assemble_second(self) -> None:
         model, a = self.model, self.model.arrays
         mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
-        model.assemble(explicit=EXPLICIT, mass=mass, step_size=a["stage_size"])
+        model.assemble(explicit=self._explicit, mass=mass, step_size=a["stage_size"])
         if a["anchor"] is not None:
             model.launch("second_stage_damping", "crossings")
 

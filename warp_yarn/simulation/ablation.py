@@ -14,9 +14,6 @@ from ..kernels import TERMS
 from .simulator import Simulator
 from .state import State
 
-KEPT = ("mass", "pins", "applied")
-"""Terms that are never left out: the equation of motion, and what is done to the cloth."""
-
 DEARER = -0.1
 """Costs below this are worth a word: the solver needs the term more than the cloth does."""
 
@@ -127,10 +124,10 @@ def ablate(
     def run(scene: Scene, fine: int = 1) -> _Run:
         return _Run(scene, fine * steps, step / fine, start, options)
 
-    left_out = [name for name in scene.terms if name not in KEPT] + ["sliding"] * scene.sliding
     full, half = run(scene), run(_halved(scene, start), 2)
     full.make()
     half.make()
+    left_out = [name for name in scene.terms if not TERMS[name].kept] + ["sliding"] * scene.sliding
     moved = full.distance(full.position[0])
     if moved == 0.0:
         raise InputError("the cloth does not move: there is nothing that a change could be relative to")

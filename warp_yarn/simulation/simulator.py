@@ -17,14 +17,15 @@ import tqdm
 import warp as wp
 
 from ..description.scene import Scene
-from ..device.arrays import STATE_TYPES, YARN_PARAMETERS
+from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from ..device.model import Graphs, Model
 from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
+from ..kernels import parameters
 from ..kernels.core import status
 from .linear_system import System, gather
-from .state import CLOTH_NUMBERS, FIELDS, State, Trajectory
+from .state import FIELDS, State, Trajectory
 from .substepping import Parts
 
 CHUNK_BYTES = 1 << 24
@@ -53,20 +54,8 @@ def _alone(method: Callable) -> Callable:
     return alone
 
 
-PARAMETERS = (
-    *YARN_PARAMETERS,
-    *CLOTH_NUMBERS,
-    "gravity",
-    "wind_velocity",
-    "wind_density",
-    "wind_drag",
-    "pin_stiffness",
-    "pin_target",
-    "pin_target_path",
-    "applied_force",
-    "applied_force_path",
-)
-"""Arrays that hold what a scene says, and that the simulator's owner may change."""
+BESIDE_TERMS = ("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path")
+"""Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
 
 
 class Simulator:
@@ -217,7 +206,8 @@ class Simulator:
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles are simulators of the same scene and options, with the state and parameters of this."""
         with self.lock:
-            values = {name: self.arrays[name].numpy().copy() for name in PARAMETERS if name in self.arrays}
+            names = [name for name in (*BESIDE_TERMS, *parameters()) if name in self.arrays]
+            values = {name: self.arrays[name].numpy().copy() for name in names}
             steps = (self.steps_done, dict(self.split_steps), set(self.damped_steps))
             rest = (self.state, *steps, self.parts.size, values)
         return _rebuilt, (type(self), self.scene, self._options, *rest)
@@ -599,7 +589,7 @@ class Simulator:
                 if term.name == "mass":
                     continue
                 a.zero("force", "euler_force", "friction_force_out")
-                if term.name == "friction":
+                if term.reads_forces:
                     a["euler_force"].assign(total)
                 self.model.launch(term.name, term.elements, matrix=0, press=0)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"

@@ -221,6 +221,8 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
         "force_nodes": scene.force_nodes,
         **{f"force_{node}": force for node, force in scene.forces.items()},
+        "parameters": list(scene.parameters) or None,
+        **{f"parameter_{name}": values for name, values in scene.parameters.items()},
     }
     return {f"scene_{name}": value for name, value in values.items() if value is not None}
 
@@ -231,7 +233,7 @@ def _unpacked(cloth: Cloth, data: Any) -> Scene:
     def value(name: str) -> Any:
         return data.get(f"scene_{name}")
 
-    wind, stiffness = value("wind"), value("pin_stiffness")
+    wind, stiffness, named = value("wind"), value("pin_stiffness"), value("parameters")
     return Scene(
         cloth,
         gravity=value("gravity"),
@@ -243,4 +245,5 @@ def _unpacked(cloth: Cloth, data: Any) -> Scene:
         sliding=value("sliding").item(),
         terms=value("terms").tolist(),
         published_scaling=value("published_scaling").item(),
+        parameters={} if named is None else {name: value(f"parameter_{name}").tolist() for name in named.tolist()},
     )
