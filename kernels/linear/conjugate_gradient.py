@@ -20,6 +20,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core import memory
+from ..core.structs import structs
 from ..core.variant import Variant
 from . import block_matrix, incomplete_cholesky
 from . import threads as teams
@@ -33,7 +34,9 @@ def define(variant: Variant) -> SimpleNamespace:
     )  # fmt: skip
     at, put = memory.functions(variant).at, memory.functions(variant).put
     times, gather, spread = (getattr(block_matrix.functions(variant), name) for name in ("times", "gather", "spread"))
-    report = block_matrix.functions(variant).report
+    write_report = block_matrix.functions(variant).write_report
+    BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
+    SolveReport = structs(variant).SolveReport
     symmetric, product = (
         incomplete_cholesky.functions(variant).symmetric,
         incomplete_cholesky.functions(variant).product,
@@ -50,26 +53,11 @@ def define(variant: Variant) -> SimpleNamespace:
         team: wp.array(dtype=int),
         nodes: int,
         columns: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         beta: scalar,
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
-        p_x: wp.array(dtype=vec3),
-        p_s: wp.array(dtype=scalar),
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
+        work: SolverWork,
     ) -> scalar:
         """p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a strip, and its part of t·A t."""
         first = share(columns, strip, strips)
@@ -84,30 +72,30 @@ def define(variant: Variant) -> SimpleNamespace:
                 if strips > 1:
                     keep_pace(team, strip, strip + 1, strip - 1, strips, width - 1 - column, width, swept + row)
                 i = begin + column
-                w, w_u, w_v = gather(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, t_x, t_s)
-                p = at(r_x, i) + at(p_x, i) * beta
+                w, w_u, w_v = gather(i, blocks, work.t_x, work.t_s)
+                p = at(work.r_x, i) + at(work.p_x, i) * beta
                 t = product(at(inverse_pivot, i), p - w)
-                q = w + product(symmetric(at(diagonal_xx, i)), t)
-                put(p_x, i, p)
-                put(t_x, i, t)
+                q = w + product(symmetric(at(blocks.diagonal_xx, i)), t)
+                put(work.p_x, i, p)
+                put(work.t_x, i, t)
                 if wp.static(sliding):
-                    p_u = at(r_s, 2 * i) + at(p_s, 2 * i) * beta
-                    p_v = at(r_s, 2 * i + 1) + at(p_s, 2 * i + 1) * beta
+                    p_u = at(work.r_s, 2 * i) + at(work.p_s, 2 * i) * beta
+                    p_v = at(work.r_s, 2 * i + 1) + at(work.p_s, 2 * i + 1) * beta
                     u = at(inverse_s, 2 * i) * (p_u - w_u)
                     v = at(inverse_s, 2 * i + 1) * (p_v - w_v)
-                    xs_u = at(diagonal_xs, 2 * i)
-                    xs_v = at(diagonal_xs, 2 * i + 1)
+                    xs_u = at(blocks.diagonal_xs, 2 * i)
+                    xs_v = at(blocks.diagonal_xs, 2 * i + 1)
                     q += xs_u * u + xs_v * v
-                    q_u = w_u + wp.dot(xs_u, t) + at(diagonal_ss, 2 * i) * u
-                    q_v = w_v + wp.dot(xs_v, t) + at(diagonal_ss, 2 * i + 1) * v
-                    put(p_s, 2 * i, p_u)
-                    put(p_s, 2 * i + 1, p_v)
-                    put(t_s, 2 * i, u)
-                    put(t_s, 2 * i + 1, v)
-                    put(q_s, 2 * i, q_u)
-                    put(q_s, 2 * i + 1, q_v)
+                    q_u = w_u + wp.dot(xs_u, t) + at(blocks.diagonal_ss, 2 * i) * u
+                    q_v = w_v + wp.dot(xs_v, t) + at(blocks.diagonal_ss, 2 * i + 1) * v
+                    put(work.p_s, 2 * i, p_u)
+                    put(work.p_s, 2 * i + 1, p_v)
+                    put(work.t_s, 2 * i, u)
+                    put(work.t_s, 2 * i + 1, v)
+                    put(work.q_s, 2 * i, q_u)
+                    put(work.q_s, 2 * i + 1, q_v)
                     curvature += u * (q_u + w_u) + v * (q_v + w_v)
-                put(q_x, i, q)
+                put(work.q_x, i, q)
                 curvature += wp.dot(t, q + w)
                 column -= 1
             if strips > 1:
@@ -122,23 +110,13 @@ def define(variant: Variant) -> SimpleNamespace:
         team: wp.array(dtype=int),
         nodes: int,
         columns: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         alpha: scalar,
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
+        work: SolverWork,
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
     ) -> scalar:
         """q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a strip, and its part of r·E⁻¹r."""
         first = share(columns, strip, strips)
@@ -154,29 +132,29 @@ def define(variant: Variant) -> SimpleNamespace:
                     keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
                 i = begin + column
                 inverse = at(inverse_pivot, i)
-                t = at(t_x, i)
-                q = at(q_x, i)
+                t = at(work.t_x, i)
+                q = at(work.q_x, i)
                 if wp.static(sliding):
                     inverse_u = at(inverse_s, 2 * i)
                     inverse_v = at(inverse_s, 2 * i + 1)
-                    u = at(t_s, 2 * i)
-                    v = at(t_s, 2 * i + 1)
-                    q_u = at(q_s, 2 * i)
-                    q_v = at(q_s, 2 * i + 1)
+                    u = at(work.t_s, 2 * i)
+                    v = at(work.t_s, 2 * i + 1)
+                    q_u = at(work.q_s, 2 * i)
+                    q_v = at(work.q_s, 2 * i + 1)
                     y_u = inverse_u * q_u - u
                     y_v = inverse_v * q_v - v
                     put(euler_solution, 2 * i, at(euler_solution, 2 * i) + u * alpha)
                     put(euler_solution, 2 * i + 1, at(euler_solution, 2 * i + 1) + v * alpha)
-                    r_u = at(r_s, 2 * i) - q_u * alpha
-                    r_v = at(r_s, 2 * i + 1) - q_v * alpha
-                    put(r_s, 2 * i, r_u)
-                    put(r_s, 2 * i + 1, r_v)
+                    r_u = at(work.r_s, 2 * i) - q_u * alpha
+                    r_v = at(work.r_s, 2 * i + 1) - q_v * alpha
+                    put(work.r_s, 2 * i, r_u)
+                    put(work.r_s, 2 * i + 1, r_v)
                     rz += r_u * inverse_u * r_u + r_v * inverse_v * r_v
                 y = product(inverse, q) - t
-                spread(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, y, y_u, y_v, q_x, q_s)
+                spread(i, blocks, y, y_u, y_v, work.q_x, work.q_s)
                 put(solution, i, at(solution, i) + t * alpha)
-                r = at(r_x, i) - q * alpha
-                put(r_x, i, r)
+                r = at(work.r_x, i) - q * alpha
+                put(work.r_x, i, r)
                 rz += wp.dot(r, product(inverse, r))
                 column += 1
             if strips > 1:
@@ -190,15 +168,7 @@ def define(variant: Variant) -> SimpleNamespace:
         # matrix
         nodes: int,
         columns: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         # right-hand side, and when to stop
@@ -209,20 +179,8 @@ def define(variant: Variant) -> SimpleNamespace:
         # start in, solution out
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
-        # work space
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
-        p_x: wp.array(dtype=vec3),
-        p_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        sums: wp.array(dtype=scalar),
-        # report out
-        iterations: wp.array(dtype=int),
-        residual: wp.array(dtype=scalar),
-        status: wp.array(dtype=int),
+        work: SolverWork,
+        report: SolveReport,
     ):
         """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch of one thread a strip.
 
@@ -252,15 +210,15 @@ def define(variant: Variant) -> SimpleNamespace:
             swept = team[16 + 16 * strip]
             start = zero
             for i in range(begin, end):
-                put(r_x, i, at(rhs, i))
-                put(p_x, i, vec3())
+                put(work.r_x, i, at(rhs, i))
+                put(work.p_x, i, vec3())
                 start += wp.dot(at(solution, i), at(solution, i))
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        put(r_s, s, at(euler_rhs, s))
-                        put(p_s, s, zero)
+                        put(work.r_s, s, at(euler_rhs, s))
+                        put(work.p_s, s, zero)
                         start += at(euler_solution, s) * at(euler_solution, s)
-            start = total(start, 0, strip, strips, met, team, sums)
+            start = total(start, 0, strip, strips, met, team, work.sums)
             # r = E (E + U)⁻ᵀ (b − A x)
             rz = zero
             u = zero
@@ -275,40 +233,40 @@ def define(variant: Variant) -> SimpleNamespace:
                     i = row * columns + first + column
                     inverse = at(inverse_pivot, i)
                     x = vec3()
-                    r = at(r_x, i)
+                    r = at(work.r_x, i)
                     if start != zero:
                         x = at(solution, i)
                         w, w_u, w_v = gather(
-                            i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution
+                            i, blocks, solution, euler_solution
                         )
-                        r -= w + times(at(diagonal_xx, i), x)
+                        r -= w + times(at(blocks.diagonal_xx, i), x)
                         if wp.static(sliding):
                             u = at(euler_solution, 2 * i)
                             v = at(euler_solution, 2 * i + 1)
-                            xs_u = at(diagonal_xs, 2 * i)
-                            xs_v = at(diagonal_xs, 2 * i + 1)
+                            xs_u = at(blocks.diagonal_xs, 2 * i)
+                            xs_v = at(blocks.diagonal_xs, 2 * i + 1)
                             r -= xs_u * u + xs_v * v
-                            r_u = at(r_s, 2 * i) - w_u - wp.dot(xs_u, x) - at(diagonal_ss, 2 * i) * u
-                            r_v = at(r_s, 2 * i + 1) - w_v - wp.dot(xs_v, x) - at(diagonal_ss, 2 * i + 1) * v
-                            put(r_s, 2 * i, r_u)
-                            put(r_s, 2 * i + 1, r_v)
-                        put(r_x, i, r)
+                            r_u = at(work.r_s, 2 * i) - w_u - wp.dot(xs_u, x) - at(blocks.diagonal_ss, 2 * i) * u
+                            r_v = at(work.r_s, 2 * i + 1) - w_v - wp.dot(xs_v, x) - at(blocks.diagonal_ss, 2 * i + 1) * v
+                            put(work.r_s, 2 * i, r_u)
+                            put(work.r_s, 2 * i + 1, r_v)
+                        put(work.r_x, i, r)
                     y = product(inverse, r)
                     rz += wp.dot(r, y)
                     if wp.static(sliding):
-                        y_u = at(inverse_s, 2 * i) * at(r_s, 2 * i)
-                        y_v = at(inverse_s, 2 * i + 1) * at(r_s, 2 * i + 1)
-                        rz += at(r_s, 2 * i) * y_u + at(r_s, 2 * i + 1) * y_v
+                        y_u = at(inverse_s, 2 * i) * at(work.r_s, 2 * i)
+                        y_v = at(inverse_s, 2 * i + 1) * at(work.r_s, 2 * i + 1)
+                        rz += at(work.r_s, 2 * i) * y_u + at(work.r_s, 2 * i + 1) * y_v
                     # what is held has y = 0 and gives others its x alone
                     spread(
-                        i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss,
-                        y + x, y_u + u, y_v + v, r_x, r_s,
+                        i, blocks,
+                        y + x, y_u + u, y_v + v, work.r_x, work.r_s,
                     )  # fmt: skip
                     column += 1
                 if strips > 1:
                     ended(team, strip, swept + row + 1)
             swept += rows
-            rz = total(rz, 1, strip, strips, met + strips, team, sums)
+            rz = total(rz, 1, strip, strips, met + strips, team, work.sums)
             met += strips
             size = rz
 
@@ -317,22 +275,20 @@ def define(variant: Variant) -> SimpleNamespace:
             beta = zero
             while count < most_iterations and rz > limit:
                 curvature = backward_sweep(
-                    strip, strips, swept, team, nodes, columns, stencil, neighbour,
-                    diagonal_xx, diagonal_xs, diagonal_ss, upper_xx, upper_xs, upper_sx, upper_ss,
-                    inverse_pivot, inverse_s, beta, r_x, r_s, p_x, p_s, t_x, t_s, q_x, q_s,
+                    strip, strips, swept, team, nodes, columns, blocks,
+                    inverse_pivot, inverse_s, beta, work,
                 )  # fmt: skip
-                curvature = total(curvature, 3, strip, strips, met + strips, team, sums)
+                curvature = total(curvature, 3, strip, strips, met + strips, team, work.sums)
                 swept += rows
                 met += strips
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break
                 rz_next = forward_sweep(
-                    strip, strips, swept, team, nodes, columns, stencil, neighbour,
-                    upper_xx, upper_xs, upper_sx, upper_ss, inverse_pivot, inverse_s,
-                    rz / curvature, t_x, t_s, q_x, q_s, solution, euler_solution, r_x, r_s,
+                    strip, strips, swept, team, nodes, columns, blocks, inverse_pivot, inverse_s,
+                    rz / curvature, work, solution, euler_solution,
                 )  # fmt: skip
-                rz_next = total(rz_next, 4, strip, strips, met + strips, team, sums)
+                rz_next = total(rz_next, 4, strip, strips, met + strips, team, work.sums)
                 swept += rows
                 met += strips
                 beta = rz_next / rz
@@ -341,12 +297,12 @@ def define(variant: Variant) -> SimpleNamespace:
             if strips > 1:
                 meet(team, met + strips)
             if strip == 0:
-                if report(count, rz, size, limit, iterations, residual, status):
+                if write_report(count, rz, size, limit, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
-                        here = wp.dot(at(r_x, i), product(at(inverse_pivot, i), at(r_x, i)))
+                        here = wp.dot(at(work.r_x, i), product(at(inverse_pivot, i), at(work.r_x, i)))
                         if not (here <= worst):
                             worst = here
-                            status[1] = i
+                            report.status[1] = i
 
     return SimpleNamespace(incomplete_conjugate_gradient=incomplete_conjugate_gradient)

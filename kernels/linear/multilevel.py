@@ -18,10 +18,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core import memory
+from ..core.structs import structs
 from ..core.variant import Variant
 from . import block_matrix, incomplete_cholesky, lines
 from . import threads as teams
-from .lines import BLOCKS
 from .threads import call, meet, share, wait_for_call
 
 SAFE = {wp.float64: 1e-12, wp.float32: 1e-5}
@@ -31,10 +31,10 @@ _ROW = (
     block_matrix.UPPER
     + """
     auto add_lower = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
-        const int j = lower.data[stencil * i + slot];
+        const int j = lower.data[blocks.stencil * i + slot];
         if (j < 0)
             return;
-        const SCALAR* m = upper_xx.data[stencil * j + slot].data[0];
+        const SCALAR* m = blocks.upper_xx.data[blocks.stencil * j + slot].data[0];
         const SCALAR* of = x.data[j].c;
         x_s = x_s + *(const row*)m * of[0] + *(const row*)(m + 3) * of[1] + *(const row*)(m + 6) * of[2];
 #if SLIDING
@@ -42,20 +42,20 @@ _ROW = (
             const int k = 4 * j + slot;
             const SCALAR along = s.data[2 * j + direction];
             const row its = {of[0], of[1], of[2], 0};
-            x_s = x_s + *(const row*)upper_sx.data[k].c * along;
-            s_x = s_x + *(const row*)upper_xs.data[k].c * its;
-            s_s += upper_ss.data[k] * along;
+            x_s = x_s + *(const row*)blocks.upper_sx.data[k].c * along;
+            s_x = s_x + *(const row*)blocks.upper_xs.data[k].c * its;
+            s_s += blocks.upper_ss.data[k] * along;
         }
 #endif
     };
-    for (int slot = 0; slot < stencil; slot += 2) {
+    for (int slot = 0; slot < blocks.stencil; slot += 2) {
         add(slot, 0, u_x, u_s);
         add(slot + 1, 1, v_x, v_s);
         add_lower(slot, 0, u_x, u_s);
         add_lower(slot + 1, 1, v_x, v_s);
     }
     const SCALAR* of = x.data[i].c;
-    const SCALAR* m = diagonal_xx.data[i].data[0];
+    const SCALAR* m = blocks.diagonal_xx.data[i].data[0];
     const row its = {of[0], of[1], of[2], 0};
     a = a + *(const row*)m * its;
     b = b + *(const row*)(m + 3) * its;
@@ -63,14 +63,14 @@ _ROW = (
     c = c + row{m[6], m[7], m[8], 0} * its;
 #if SLIDING
     const SCALAR u = s.data[2 * i], v = s.data[2 * i + 1];
-    const SCALAR* xs_u = diagonal_xs.data[2 * i].c;
-    const SCALAR* xs_v = diagonal_xs.data[2 * i + 1].c;
+    const SCALAR* xs_u = blocks.diagonal_xs.data[2 * i].c;
+    const SCALAR* xs_v = blocks.diagonal_xs.data[2 * i + 1].c;
     for (int k = 0; k < 3; ++k)
         x_s[k] += xs_u[k] * u + xs_v[k] * v;
     const SCALAR y_u = u_x[0] + u_x[1] + u_x[2] + u_s + xs_u[0] * of[0] + xs_u[1] * of[1] + xs_u[2] * of[2]
-        + diagonal_ss.data[2 * i] * u;
+        + blocks.diagonal_ss.data[2 * i] * u;
     const SCALAR y_v = v_x[0] + v_x[1] + v_x[2] + v_s + xs_v[0] * of[0] + xs_v[1] * of[1] + xs_v[2] * of[2]
-        + diagonal_ss.data[2 * i + 1] * v;
+        + blocks.diagonal_ss.data[2 * i + 1] * v;
 #endif
     const SCALAR y_0 = a[0] + a[1] + a[2] + x_s[0];
     const SCALAR y_1 = b[0] + b[1] + b[2] + x_s[1];
@@ -90,76 +90,25 @@ _ROW = (
 
 
 @functools.cache
-def structs(variant: Variant) -> SimpleNamespace:
-    """Arrays that belong together, as one argument of a kernel."""
-    scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
-
-    @wp.struct
-    class Levels:
-        """Index arrays of ``warp_yarn.description.levels.Levels``, and the preconditioner's numbers."""
-
-        coarse_levels: int
-        warp_lines: int
-        coarse_warp_lines: int
-        exact: int
-        line_start: wp.array(dtype=int)
-        line_node: wp.array(dtype=int)
-        lower: wp.array(dtype=int)
-        level_start: wp.array(dtype=int)
-        coarse_line_start: wp.array(dtype=int)
-        coarse_line_node: wp.array(dtype=int)
-        parent: wp.array(dtype=int)
-        parent_weight: wp.array(dtype=scalar)
-        child_start: wp.array(dtype=int)
-        child: wp.array(dtype=int)
-        child_weight: wp.array(dtype=scalar)
-        block_start: wp.array(dtype=int)
-        part: wp.array(dtype=int)
-        part_weight: wp.array(dtype=scalar)
-        coarsest_slot: wp.array(dtype=int)
-        # numbers: matrices of the coarse levels, factors of all lines, ½ D⁻¹ of both lines of a node, the last level
-        coarse_block: wp.array(dtype=mat33)
-        line_factor: wp.array(dtype=scalar)
-        coarse_line_factor: wp.array(dtype=scalar)
-        halves: wp.array(dtype=sym33)
-        coarse_halves: wp.array(dtype=sym33)
-        coarsest: wp.array(dtype=scalar)
-        # work space
-        line_work: wp.array(dtype=scalar)
-        coarse_line_work: wp.array(dtype=scalar)
-        coarse_r: wp.array(dtype=vec3)
-        coarse_z: wp.array(dtype=vec3)
-
-    return SimpleNamespace(Levels=Levels)
-
-
-@functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     at, put = memory.functions(variant).at, memory.functions(variant).put
-    report = block_matrix.functions(variant).report
+    write_report = block_matrix.functions(variant).write_report
+    BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
+    SolveReport, Levels = structs(variant).SolveReport, structs(variant).Levels
     product = incomplete_cholesky.functions(variant).product
     total = teams.functions(variant).total
     line = lines.functions(variant)
     factorize_nodes, factorize_coarse = line.factorize_nodes, line.factorize_coarse
     solve_nodes, solve_coarse = line.solve_nodes, line.solve_coarse
-    Levels = structs(variant).Levels
     module = variant.module("multilevel")
     variant.fuse("multilevel")
 
     @wp.func_native(memory.rows(variant, _ROW))
     def multiply_row(
         i: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
+        blocks: BlockMatrix,
         lower: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
         x: wp.array(dtype=vec3),
         s: wp.array(dtype=scalar),
         q_x: wp.array(dtype=vec3),
@@ -173,11 +122,10 @@ def define(variant: Variant) -> SimpleNamespace:
         first: int,
         nodes: int,
         levels: Levels,
-        diagonal_xx: wp.array(dtype=mat33),
-        upper_xx: wp.array(dtype=mat33),
+        blocks: BlockMatrix,
     ):
         """A block of RᵀAR of a level, those of the level below being there."""
-        block = BLOCKS * first + wp.tid()
+        block = levels.blocks_per_node * first + wp.tid()
         result = mat33()
         for k in range(at(levels.block_start, block), at(levels.block_start, block + 1)):
             source = at(levels.part, k)
@@ -189,9 +137,9 @@ def define(variant: Variant) -> SimpleNamespace:
             if first > 0:
                 m = at(levels.coarse_block, source)
             elif source < nodes:
-                m = at(diagonal_xx, source)
+                m = at(blocks.diagonal_xx, source)
             else:
-                m = at(upper_xx, source - nodes)
+                m = at(blocks.upper_xx, source - nodes)
             if turned:
                 m = wp.transpose(m)
             result += m * weight
@@ -200,24 +148,15 @@ def define(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def factorize_lines(
         direction: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
+        blocks: BlockMatrix,
         is_free: wp.array(dtype=int),
         is_crossing: wp.array(dtype=int),
         levels: Levels,
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
     ):
         """Every line of the cloth along one direction; warp yarns come first."""
         k = wp.tid() + direction * levels.warp_lines
         factorize_nodes(
-            direction, at(levels.line_start, k), at(levels.line_start, k + 1), levels.line_node, stencil, neighbour,
-            is_free, is_crossing, diagonal_xx, diagonal_xs, diagonal_ss, upper_xx, upper_xs, upper_sx, upper_ss,
+            direction, at(levels.line_start, k), at(levels.line_start, k + 1), levels.line_node, blocks, is_free, is_crossing,
             levels.line_factor, levels.halves,
         )  # fmt: skip
 
@@ -227,7 +166,7 @@ def define(variant: Variant) -> SimpleNamespace:
         k = wp.tid() + direction * levels.coarse_warp_lines
         factorize_coarse(
             direction, at(levels.coarse_line_start, k), at(levels.coarse_line_start, k + 1), levels.coarse_line_node,
-            levels.coarse_block, levels.coarse_line_factor, levels.coarse_halves,
+            levels.blocks_per_node, levels.coarse_block, levels.coarse_line_factor, levels.coarse_halves,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
@@ -240,7 +179,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 slot = at(levels.coarsest_slot, count * i + j)
                 block = mat33()
                 if slot >= 0:
-                    block = at(levels.coarse_block, BLOCKS * (first + i) + slot)
+                    block = at(levels.coarse_block, levels.blocks_per_node * (first + i) + slot)
                 for k in range(3):
                     for m in range(3):
                         put(lower, size * (3 * j + m) + 3 * i + k, block[k, m])
@@ -371,15 +310,7 @@ def define(variant: Variant) -> SimpleNamespace:
         team: wp.array(dtype=int),
         # matrix
         nodes: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         levels: Levels,
         # right-hand side, and when to stop
         rhs: wp.array(dtype=vec3),
@@ -389,20 +320,8 @@ def define(variant: Variant) -> SimpleNamespace:
         # start in, solution out
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
-        # work space
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
-        p_x: wp.array(dtype=vec3),
-        p_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        sums: wp.array(dtype=scalar),
-        # report out
-        iterations: wp.array(dtype=int),
-        residual: wp.array(dtype=scalar),
-        status: wp.array(dtype=int),
+        work: SolverWork,
+        report: SolveReport,
     ):
         """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one thread a strip.
 
@@ -429,70 +348,68 @@ def define(variant: Variant) -> SimpleNamespace:
             unused = zero
             for i in range(begin, end):
                 unused += multiply_row(
-                    i, stencil, neighbour, levels.lower, diagonal_xx, diagonal_xs, diagonal_ss,
-                    upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution, q_x, q_s,
+                    i, blocks, levels.lower, solution, euler_solution, work.q_x, work.q_s,
                 )  # fmt: skip
-                r = at(rhs, i) - at(q_x, i)
-                put(r_x, i, r)
-                put(p_x, i, vec3())
-                put(t_x, i, -product(at(levels.halves, i), r))
+                r = at(rhs, i) - at(work.q_x, i)
+                put(work.r_x, i, r)
+                put(work.p_x, i, vec3())
+                put(work.t_x, i, -product(at(levels.halves, i), r))
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        put(r_s, s, at(euler_rhs, s) - at(q_s, s))
-                        put(p_s, s, zero)
-            rz = precondition(strip, strips, met, team, nodes, levels, r_x, r_s, t_x, t_s)
+                        put(work.r_s, s, at(euler_rhs, s) - at(work.q_s, s))
+                        put(work.p_s, s, zero)
+            rz = precondition(strip, strips, met, team, nodes, levels, work.r_x, work.r_s, work.t_x, work.t_s)
             met += strips * (meetings(levels) + 1)
-            rz = total(rz, 0, strip, strips, met, team, sums)
+            rz = total(rz, 0, strip, strips, met, team, work.sums)
             size = rz
             limit = tolerance[0] * tolerance[0] * size
             count = int(0)
             beta = zero
             while count < most_iterations and rz > limit:
                 for i in range(begin, end):
-                    put(p_x, i, at(t_x, i) + at(p_x, i) * beta)
+                    put(work.p_x, i, at(work.t_x, i) + at(work.p_x, i) * beta)
                     if wp.static(sliding):
-                        put(p_s, 2 * i, at(t_s, 2 * i) + at(p_s, 2 * i) * beta)
-                        put(p_s, 2 * i + 1, at(t_s, 2 * i + 1) + at(p_s, 2 * i + 1) * beta)
+                        put(work.p_s, 2 * i, at(work.t_s, 2 * i) + at(work.p_s, 2 * i) * beta)
+                        put(work.p_s, 2 * i + 1, at(work.t_s, 2 * i + 1) + at(work.p_s, 2 * i + 1) * beta)
                 if strips > 1:
                     met += strips
                     meet(team, met)
                 curvature = zero
                 for i in range(begin, end):
                     curvature += multiply_row(
-                        i, stencil, neighbour, levels.lower, diagonal_xx, diagonal_xs, diagonal_ss,
-                        upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
+                        i, blocks, levels.lower, work.p_x, work.p_s, work.q_x, work.q_s,
                     )  # fmt: skip
                 met += strips
-                curvature = total(curvature, 1, strip, strips, met, team, sums)
+                curvature = total(curvature, 1, strip, strips, met, team, work.sums)
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break
                 alpha = rz / curvature
                 for i in range(begin, end):
-                    put(solution, i, at(solution, i) + at(p_x, i) * alpha)
-                    r = at(r_x, i) - at(q_x, i) * alpha
-                    put(r_x, i, r)
-                    put(t_x, i, -product(at(levels.halves, i), r))
+                    put(solution, i, at(solution, i) + at(work.p_x, i) * alpha)
+                    r = at(work.r_x, i) - at(work.q_x, i) * alpha
+                    put(work.r_x, i, r)
+                    put(work.t_x, i, -product(at(levels.halves, i), r))
                     if wp.static(sliding):
                         for s in range(2 * i, 2 * i + 2):
-                            put(euler_solution, s, at(euler_solution, s) + at(p_s, s) * alpha)
-                            put(r_s, s, at(r_s, s) - at(q_s, s) * alpha)
-                rz_next = precondition(strip, strips, met, team, nodes, levels, r_x, r_s, t_x, t_s)
+                            put(euler_solution, s, at(euler_solution, s) + at(work.p_s, s) * alpha)
+                            put(work.r_s, s, at(work.r_s, s) - at(work.q_s, s) * alpha)
+                rz_next = precondition(strip, strips, met, team, nodes, levels, work.r_x, work.r_s, work.t_x, work.t_s)
                 met += strips * (meetings(levels) + 1)
-                rz_next = total(rz_next, 2 + count % 2, strip, strips, met, team, sums)
+                rz_next = total(rz_next, 2 + count % 2, strip, strips, met, team, work.sums)
                 beta = rz_next / rz
                 rz = rz_next
                 count += 1
             if strips > 1:
                 meet(team, met + strips)
             if strip == 0:
-                if report(count, rz, size, limit, iterations, residual, status):
+                if write_report(count, rz, size, limit, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
-                        here = wp.dot(at(r_x, i), at(t_x, i))
+                        here = wp.dot(at(work.r_x, i), at(work.t_x, i))
                         if not (here <= worst):
                             worst = here
-                            status[1] = i
+                            report.status[1] = i
 
     return SimpleNamespace(
         coarsen=coarsen,

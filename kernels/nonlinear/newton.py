@@ -13,9 +13,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import coordinates, index
+from ..core.indexing import ends, index
 from ..core.memory import functions as access
-from ..core.status import NOT_FINITE, ORDER_LOST, STALLED
+from ..core.status import NOT_FINITE, ORDER_LOST, STALLED, fail
+from ..core.structs import structs
 from ..core.variant import Variant
 
 MOST_TRIES = 200
@@ -52,6 +53,7 @@ COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     at, put = access(variant).at, access(variant).put
+    NewtonControl = structs(variant).NewtonControl
     module = variant.module("stage")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -86,9 +88,7 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def look_ahead(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         stage_size: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
         base_euler: wp.array(dtype=scalar),
@@ -98,14 +98,12 @@ def define(variant: Variant) -> SimpleNamespace:
     ):
         """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
         has them much nearer to each other than the first stage left them."""
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         rest = base_euler[sb] - base_euler[sa]
         if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
             crosses[0] = 1
         if rest < scalar(EXTRAPOLATED) * (euler[sb] - euler[sa]):
-            if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
-                status[1] = segment_nodes[e][0]
+            fail(status, wp.static(ORDER_LOST), a)
 
     @wp.kernel(module=module, enable_backward=False)
     def correct(
@@ -127,19 +125,16 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def lump_mass(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         density: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
         node_mass: wp.array(dtype=scalar),
     ):
         """Half of every segment's mass to each of its nodes."""
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
-        m = scalar(0.5) * density[index(segment_yarn[e])] * (euler[sb] - euler[sa])
-        wp.atomic_add(node_mass, index(segment_nodes[e][0]), m)
-        wp.atomic_add(node_mass, index(segment_nodes[e][1]), m)
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        m = scalar(0.5) * density[yarn] * (euler[sb] - euler[sa])
+        wp.atomic_add(node_mass, a, m)
+        wp.atomic_add(node_mass, b, m)
 
     @wp.kernel(module=module, enable_backward=False)
     def start_rigid(
@@ -170,9 +165,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_solution: wp.array(dtype=scalar),
         base_velocity: wp.array(dtype=vec3),
         base_euler_velocity: wp.array(dtype=scalar),
-        slope: wp.array(dtype=scalar),
-        kinetic: wp.array(dtype=scalar),
-        step_length: wp.array(dtype=scalar),
+        control: NewtonControl,
     ):
         """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, and of the change of velocity
         g = w + δ − v₀ that it leads to, g·M g."""
@@ -192,26 +185,15 @@ def define(variant: Variant) -> SimpleNamespace:
                     gain_s = at(euler_solution, s) + d_s - at(base_euler_velocity, s)
                     along += scalar(0.5) * gain_s * gain_s
             square += at(node_mass, i) * (wp.dot(gain, gain) + along)
-        slope[0] = total
-        kinetic[0] = square
-        step_length[0] = scalar(1.0)
+        control.slope[0] = total
+        control.kinetic[0] = square
+        control.step_length[0] = scalar(1.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def decide(
         stage: int,
-        newton_tolerance: wp.array(dtype=scalar),
-        slope: wp.array(dtype=scalar),
-        kinetic: wp.array(dtype=scalar),
-        step_length: wp.array(dtype=scalar),
-        # of the step of the iteration before; of the time step
-        last_norm: wp.array(dtype=scalar),
-        contraction: wp.array(dtype=scalar),
-        change: wp.array(dtype=scalar),
-        first_change: wp.array(dtype=scalar),
-        steps: wp.array(dtype=int),
-        finishes: wp.array(dtype=int),
-        newton_iterations: wp.array(dtype=int),
         residual: wp.array(dtype=scalar),
+        control: NewtonControl,
         status: wp.array(dtype=int),
     ):
         """Whether the step along δ is the last one: what it leaves is small beside how much velocities change.
@@ -219,32 +201,32 @@ def define(variant: Variant) -> SimpleNamespace:
         ‖δ‖ is in the norm of A, √(δ·A δ) = √(r·δ), which is more than that of M, and the change in that of M: kinetic
         energy. What it leaves is taken from the contraction.
         """
-        norm = wp.sqrt(wp.max(slope[0], scalar(0.0)))
+        norm = wp.sqrt(wp.max(control.slope[0], scalar(0.0)))
         left = scalar(CAUTION)
-        if steps[0] > 0:
-            contraction[0] = wp.max(norm / last_norm[0], scalar(TRUSTED))
-            left *= contraction[0]
+        if control.steps[0] > 0:
+            control.contraction[0] = wp.max(norm / control.last_norm[0], scalar(TRUSTED))
+            left *= control.contraction[0]
         elif stage == 0:
             # not known of a time step's first
             left = scalar(1.0)
         else:
             # that of the stage before, whose matrix this one begins with
-            left *= contraction[0] * scalar(CAUTION)
+            left *= control.contraction[0] * scalar(CAUTION)
         # not of the first δ, of which the line search may take little
-        change[0] = wp.sqrt(kinetic[0])
+        control.change[0] = wp.sqrt(control.kinetic[0])
         if stage == 0:
-            first_change[0] = change[0]
+            control.first_change[0] = control.change[0]
         else:
-            change[0] = wp.max(change[0], first_change[0])
-        steps[0] = steps[0] + 1
-        last_norm[0] = norm
-        newton_iterations[0] = newton_iterations[0] + 1
+            control.change[0] = wp.max(control.change[0], control.first_change[0])
+        control.steps[0] = control.steps[0] + 1
+        control.last_norm[0] = norm
+        control.newton_iterations[0] = control.newton_iterations[0] + 1
         if status[0] == 0:
-            residual[0] = norm / wp.max(change[0], scalar(1.0e-30))
-        finishes[0] = 0
-        small = left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]
-        if norm == scalar(0.0) or (step_length[0] == scalar(1.0) and small):
-            finishes[0] = 1
+            residual[0] = norm / wp.max(control.change[0], scalar(1.0e-30))
+        control.finishes[0] = 0
+        small = left < scalar(1.0) and left * norm <= control.newton_tolerance[0] * control.change[0]
+        if norm == scalar(0.0) or (control.step_length[0] == scalar(1.0) and small):
+            control.finishes[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -256,22 +238,10 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_rhs: wp.array(dtype=scalar),
         direction: wp.array(dtype=vec3),
         euler_direction: wp.array(dtype=scalar),
-        shortest: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         stage_size: wp.array(dtype=scalar),
-        newton_tolerance: wp.array(dtype=scalar),
-        last_norm: wp.array(dtype=scalar),
-        change: wp.array(dtype=scalar),
-        # line search, in and out
-        slope: wp.array(dtype=scalar),
-        step_length: wp.array(dtype=scalar),
-        size: wp.array(dtype=scalar),
-        tries: wp.array(dtype=int),
-        # what to do next, and report, out
-        continues: wp.array(dtype=int),
-        solves: wp.array(dtype=int),
-        refreshes: wp.array(dtype=int),
+        control: NewtonControl,
         status: wp.array(dtype=int),
     ):
         """Whether Newton's iteration goes on from w, takes back half of the way to w, or cannot go further.
@@ -305,76 +275,70 @@ def define(variant: Variant) -> SimpleNamespace:
         now = wp.sqrt(of_rhs)
         # velocities that positions are too coarse to tell from 0
         rounding = wp.sqrt(of_rounding) * scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
-        before = size[0]
-        first = tries[0] == 0
-        tries[0] = tries[0] + 1
-        continues[0] = 1
-        solves[0] = 1
-        refreshes[0] = 0
-        stalled = tries[0] > wp.static(MOST_TRIES)
+        before = control.size[0]
+        first = control.tries[0] == 0
+        control.tries[0] = control.tries[0] + 1
+        control.continues[0] = 1
+        control.solves[0] = 1
+        control.refreshes[0] = 0
+        stalled = control.tries[0] > wp.static(MOST_TRIES)
         ordered = bool(True)
         if wp.static(sliding):
-            ordered = shortest[0] > scalar(0.0)
-            shortest[0] = scalar(wp.static(1.0e30))
-        if first or (ordered and (now < before or turned > scalar(-TURNED) * slope[0])):
+            ordered = control.shortest[0] > scalar(0.0)
+            control.shortest[0] = scalar(wp.static(1.0e30))
+        if first or (ordered and (now < before or turned > scalar(-TURNED) * control.slope[0])):
             if not first and now > scalar(SLOW) * before:
                 # a step that hardly helps: the matrix is of another state
-                refreshes[0] = 1
+                control.refreshes[0] = 1
             if now == scalar(0.0) or (not first and now > scalar(0.5) * before and now <= rounding):
                 # what no longer falls, and is less than positions can tell, is rounding
-                continues[0] = 0
-            size[0] = now
+                control.continues[0] = 0
+            control.size[0] = now
             before = now
-        elif last_norm[0] <= newton_tolerance[0] * change[0]:
+        elif control.last_norm[0] <= control.newton_tolerance[0] * control.change[0]:
             # the step was small enough before it was taken: rounding
-            continues[0] = 0
+            control.continues[0] = 0
         else:
-            solves[0] = 0
-            refreshes[0] = 1
-            step_length[0] = step_length[0] * scalar(0.5)
-            stalled = stalled or step_length[0] < scalar(wp.static(SHORTEST_STEP))
+            control.solves[0] = 0
+            control.refreshes[0] = 1
+            control.step_length[0] = control.step_length[0] * scalar(0.5)
+            stalled = stalled or control.step_length[0] < scalar(wp.static(SHORTEST_STEP))
         if status[0] != 0:
-            continues[0] = 0
+            control.continues[0] = 0
         elif not wp.isfinite(before):
-            continues[0] = 0
+            control.continues[0] = 0
             status[0] = wp.static(NOT_FINITE)
             status[1] = -1
             for i in range(nodes):
                 if is_free[i] != 0 and not (wp.isfinite(rhs[i]) and wp.min(inverse_x[i]) > scalar(0.0)):
                     status[1] = i
-        elif stalled and continues[0] != 0:
-            continues[0] = 0
+        elif stalled and control.continues[0] != 0:
+            control.continues[0] = 0
             # what rounding leaves cannot be taken away; nor is there a need to where the last step was small enough
-            small = not first and last_norm[0] <= newton_tolerance[0] * change[0]
+            small = not first and control.last_norm[0] <= control.newton_tolerance[0] * control.change[0]
             if not (small or before <= rounding * scalar(wp.static(ROUNDING))):
                 status[0] = wp.static(STALLED)
                 status[1] = -1
 
     @wp.kernel(module=module, enable_backward=False)
     def shortest_segment(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         euler: wp.array(dtype=scalar),
         shortest: wp.array(dtype=scalar),
     ):
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         wp.atomic_min(shortest, 0, euler[sb] - euler[sa])
 
     @wp.kernel(module=module, enable_backward=False)
     def keep_order(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         stage_size: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
         euler_direction: wp.array(dtype=scalar),
         step_length: wp.array(dtype=scalar),
     ):
         """Shortens the step along δ so far that it leaves something of every Δs."""
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
         allowed = rest * scalar(wp.static(1.0 - NEAREST))
@@ -383,16 +347,14 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def ask_for_matrix(
-        segment_nodes: wp.array(dtype=wp.vec2i),
+        segments: wp.array(dtype=wp.vec4i),
         step_size: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
         solution: wp.array(dtype=vec3),
         refreshes: wp.array(dtype=int),
     ):
         """Asks for a new matrix where a yarn turns in the step."""
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         moved = wp.length(solution[b] - solution[a]) * step_size[0]
         if moved > scalar(wp.static(TURNING)) * spacing[0]:
             refreshes[0] = 1

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import coordinates, index
-from ..core.status import NOT_FINITE, ORDER_LOST
+from ..core.indexing import ends, index
+from ..core.status import NOT_FINITE, ORDER_LOST, fail
 from ..core.variant import Variant
 
 
@@ -115,23 +115,18 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler[s] = u
                 finite = finite and wp.isfinite(u)
         if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_order(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         euler: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
         """Δs > 0: crossings keep their order along a yarn."""
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         if euler[sb] <= euler[sa]:
-            if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
-                status[1] = segment_nodes[e][0]
+            fail(status, wp.static(ORDER_LOST), a)
 
     @wp.kernel(module=module, enable_backward=False)
     def copy_vectors(source: wp.array(dtype=vec3), target: wp.array(dtype=vec3)):

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.status import NOT_FINITE
+from ..core.status import NOT_FINITE, fail
 from ..core.variant import Variant
 
 
@@ -52,8 +52,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_velocity_grad[s] = scalar(0.0)
                 euler_rhs_grad[s] = scalar(0.0)
         if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def matrix_adjoint(

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.status import NOT_FINITE
+from ..core.status import NOT_FINITE, fail
+from ..core.structs import structs
 from ..core.variant import Variant
 
 GAMMA = 1.0 - 0.5**0.5
@@ -27,7 +28,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
     def second_stage_damping(
         crossing_node: wp.array(dtype=int),
         friction_damping: wp.array(dtype=scalar),
-        weights: wp.array(dtype=vec3),
+        coefficients: wp.array(dtype=vec3),
         euler_velocity: wp.array(dtype=scalar),
         euler_first_solution: wp.array(dtype=scalar),
         euler_rhs: wp.array(dtype=scalar),
@@ -37,7 +38,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         for direction in range(2):
             s = 2 * i + direction
             rate = euler_velocity[s] - scalar(2.0) * euler_first_solution[s]
-            wp.atomic_add(euler_rhs, s, weights[0][1] * friction_damping[0] * rate)
+            wp.atomic_add(euler_rhs, s, coefficients[0][1] * friction_damping[0] * rate)
 
     return SimpleNamespace(second_stage_damping=second_stage_damping)
 
@@ -45,13 +46,8 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    StateAdjoint = structs(variant).StateAdjoint
     module = variant.module("ros2")
-
-    @wp.func
-    def note(finite: bool, i: int, status: wp.array(dtype=int)):
-        if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
 
     @wp.kernel(module=module, enable_backward=False)
     def enter_second_stage(
@@ -99,7 +95,8 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_increment[s] = v2_s - w_s * scalar(4.0) + v_s * scalar(2.0)
                 if euler_start:
                     euler_start[s] = -w_s
-        note(finite, i, status)
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def leave_second_stage(
@@ -133,7 +130,8 @@ def define(variant: Variant) -> SimpleNamespace:
                 finite = finite and wp.isfinite(u)
                 euler[s] = u
                 euler_velocity[s] = w_s + both_s * rate
-        note(finite, i, status)
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def recall_both_stages(
@@ -212,20 +210,14 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_stage_adjoint[s] = w2_s + v_s
                 euler_velocity_grad[s] = scalar(0.0)
                 euler_rhs_grad[s] = scalar(0.0)
-        note(finite, i, status)
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def first_stage_adjoint(
         step_size: wp.array(dtype=scalar),
         is_free: wp.array(dtype=int),
-        first_solution: wp.array(dtype=vec3),
-        euler_first_solution: wp.array(dtype=scalar),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-        position_grad: wp.array(dtype=vec3),
-        euler_grad: wp.array(dtype=scalar),
-        velocity_grad: wp.array(dtype=vec3),
-        euler_velocity_grad: wp.array(dtype=scalar),
+        adjoint: StateAdjoint,
         increment_grad: wp.array(dtype=vec3),
         euler_increment_grad: wp.array(dtype=scalar),
         euler_first_solution_grad: wp.array(dtype=scalar),
@@ -234,11 +226,9 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_stage_adjoint: wp.array(dtype=scalar),
         seed: wp.array(dtype=vec3),
         euler_seed: wp.array(dtype=scalar),
-        rhs_grad: wp.array(dtype=vec3),
-        euler_rhs_grad: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """``enter_second_stage`` in reverse: the right-hand side w̄₁, with all of it, and v̄; λ starts at 0.
+        """``enter_second_stage`` in reverse: the right-hand side w̄₁, with all of it, and v̄.
 
         q̄ is what q̄₂ is. w₂ of what is held is −w₁.
         """
@@ -247,28 +237,25 @@ def define(variant: Variant) -> SimpleNamespace:
         rate = scalar(wp.static(1.0 / GAMMA))
         one, two, four = scalar(1.0), scalar(2.0), scalar(4.0)
         m = increment_grad[i]
-        v2 = velocity_grad[i] + m
-        w1 = stage_adjoint[i] + position_grad[i] * h + v2 * rate - m * four
+        v2 = adjoint.velocity_grad[i] + m
+        w1 = stage_adjoint[i] + adjoint.position_grad[i] * h + v2 * rate - m * four
         if is_free[i] == 0:
             w1 -= solution_grad[i]
         finite = wp.isfinite(w1)
         seed[i] = w1
-        velocity_grad[i] = v2 * (one - rate) + m * two
-        rhs_grad[i] = vec3()
-        solution[i] = first_solution[i]
+        adjoint.velocity_grad[i] = v2 * (one - rate) + m * two
         if wp.static(sliding):
             for d in range(2):
                 s = 2 * i + d
                 m_s = euler_increment_grad[s]
-                v2_s = euler_velocity_grad[s] + m_s
-                w1_s = euler_stage_adjoint[s] + euler_grad[s] * h + v2_s * rate - m_s * four
+                v2_s = adjoint.euler_velocity_grad[s] + m_s
+                w1_s = euler_stage_adjoint[s] + adjoint.euler_grad[s] * h + v2_s * rate - m_s * four
                 w1_s += euler_first_solution_grad[s]
                 finite = finite and wp.isfinite(w1_s)
                 euler_seed[s] = w1_s
-                euler_velocity_grad[s] = v2_s * (one - rate) + m_s * two
-                euler_rhs_grad[s] = scalar(0.0)
-                euler_solution[s] = euler_first_solution[s]
-        note(finite, i, status)
+                adjoint.euler_velocity_grad[s] = v2_s * (one - rate) + m_s * two
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     return SimpleNamespace(
         enter_second_stage=enter_second_stage,

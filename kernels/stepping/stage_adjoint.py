@@ -11,7 +11,7 @@ import warp as wp
 
 from ..core.indexing import index
 from ..core.memory import functions as access
-from ..core.status import NOT_FINITE
+from ..core.status import NOT_FINITE, fail
 from ..core.variant import Variant
 
 
@@ -120,8 +120,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 finite = finite and wp.isfinite(r_s)
                 euler_seed[s] = r_s
         if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge_adjoint(

@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, Variant
 from . import mollifier
 
@@ -93,6 +94,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
     presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
@@ -130,7 +132,6 @@ def define(variant: Variant) -> wp.Kernel:
         bend_nodes: wp.array(dtype=wp.vec3i),
         bend_yarn: wp.array(dtype=int),
         yarn_direction: wp.array(dtype=int),
-        stencil: int,
         # parameters
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
@@ -146,14 +147,7 @@ def define(variant: Variant) -> wp.Kernel:
         contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         a = index(bend_nodes[e][0])
@@ -203,7 +197,7 @@ def define(variant: Variant) -> wp.Kernel:
             wp.atomic_add(euler_force, sa, -f_s)
 
         if matrix != 0:
-            bare = weights[0][2] * k
+            bare = blocks.coefficients[0][2] * k
             stiffness = bare * s1[0] * s2[0]
             cosine = -wp.dot(t1, t2)
             w = wp.cross(t1, t2)
@@ -224,27 +218,27 @@ def define(variant: Variant) -> wp.Kernel:
                 bb += wp.outer(t1, t1) * (gain * s1[2] * s2[0])
             if s2[2] < scalar(0.0):
                 aa += wp.outer(t2, t2) * (gain * s2[2] * s1[0])
-            wp.atomic_add(diagonal_xx, a, aa)
-            wp.atomic_add(diagonal_xx, b, bb)
-            wp.atomic_add(diagonal_xx, c, aa + bb + ab + ba)
-            wp.atomic_add(upper_xx, index(stencil * a + direction), -(aa + ab))
-            wp.atomic_add(upper_xx, index(stencil * c + direction), -(ab + bb))
-            wp.atomic_add(upper_xx, index(stencil * a + 2 + direction), ab)
+            wp.atomic_add(blocks.diagonal_xx, a, aa)
+            wp.atomic_add(blocks.diagonal_xx, b, bb)
+            wp.atomic_add(blocks.diagonal_xx, c, aa + bb + ab + ba)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + direction), -(aa + ab))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * c + direction), -(ab + bb))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + 2 + direction), ab)
             if wp.static(sliding):
                 # θ dθ = (θ/sin θ) q·dx / l
                 xs_b = q1 * (stiffness * angle_over_sine * by_l1 / rest)
                 xs_a = q2 * (stiffness * angle_over_sine * by_l2 / rest)
                 xs_c = -(xs_a + xs_b)
                 ss = bare * faded / (rest * rest)
-                wp.atomic_add(diagonal_xs, sa, xs_a)
-                wp.atomic_add(diagonal_xs, sb, -xs_b)
-                wp.atomic_add(diagonal_ss, sa, ss)
-                wp.atomic_add(diagonal_ss, sb, ss)
-                wp.atomic_add(upper_xs, 4 * a + 2 + direction, -xs_a)
-                wp.atomic_add(upper_sx, 4 * a + 2 + direction, xs_b)
-                wp.atomic_add(upper_ss, 4 * a + 2 + direction, -ss)
-                wp.atomic_add(upper_sx, 4 * a + direction, xs_c)
-                wp.atomic_add(upper_xs, 4 * c + direction, -xs_c)
+                wp.atomic_add(blocks.diagonal_xs, sa, xs_a)
+                wp.atomic_add(blocks.diagonal_xs, sb, -xs_b)
+                wp.atomic_add(blocks.diagonal_ss, sa, ss)
+                wp.atomic_add(blocks.diagonal_ss, sb, ss)
+                wp.atomic_add(blocks.upper_xs, 4 * a + 2 + direction, -xs_a)
+                wp.atomic_add(blocks.upper_sx, 4 * a + 2 + direction, xs_b)
+                wp.atomic_add(blocks.upper_ss, 4 * a + 2 + direction, -ss)
+                wp.atomic_add(blocks.upper_sx, 4 * a + direction, xs_c)
+                wp.atomic_add(blocks.upper_xs, 4 * c + direction, -xs_c)
 
     return bending_term
 

@@ -20,6 +20,7 @@ import warp as wp
 
 from ..core.indexing import index
 from ..core.variant import Variant
+from . import mollifier
 
 FADING = 0.05
 """Sine of the angle between warp and weft under which a crossing's normal fades: 3 degrees, far beyond any lock."""
@@ -126,6 +127,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 def define_normal(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     plane_normal = functions(variant).plane_normal
+    smoothstep = mollifier.functions(variant).smoothstep
 
     # a module of its own: drawing a recording needs this kernel alone, and not the minute that all terms compile
     @variant.kernel("contact")
@@ -157,7 +159,7 @@ def define_normal(variant: Variant) -> wp.Kernel:
             x = scalar(0.0)
             if full > scalar(0.0):
                 x = wp.abs(side) / full
-            n *= x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x))
+            n *= smoothstep(x)
         if (side < scalar(0.0)) != (flipped[i] != 0):
             n = -n
         normal[i] = n

@@ -24,6 +24,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, Variant
 
 FLOOR = 1.0e-7
@@ -88,6 +89,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
+    BlockMatrix = structs(variant).BlockMatrix
     friction_force = functions(variant).force
 
     @variant.kernel("terms")
@@ -112,8 +114,7 @@ def define(variant: Variant) -> wp.Kernel:
         euler_momentum: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         i = index(crossing_node[e])
@@ -132,9 +133,9 @@ def define(variant: Variant) -> wp.Kernel:
             )
             friction_force_out[s] = f[0] - friction_damping[0] * euler_velocity[s]
             if matrix != 0:
-                damping = weights[0][1] * friction_damping[0]
+                damping = blocks.coefficients[0][1] * friction_damping[0]
                 wp.atomic_add(euler_momentum, s, damping * euler_velocity[s])
-                wp.atomic_add(diagonal_ss, s, damping + weights[0][2] * f[1])
+                wp.atomic_add(blocks.diagonal_ss, s, damping + blocks.coefficients[0][2] * f[1])
 
     return friction_term
 

@@ -25,6 +25,11 @@ def functions(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
 
     @wp.func
+    def smoothstep(x: scalar) -> scalar:
+        """Rise from 0 at 0 to 1 at 1, with two derivatives of 0 at both."""
+        return x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x))
+
+    @wp.func
     def presence(length: scalar, spacing: scalar) -> vec3:
         """(s, s', s'') of a segment."""
         reach = spacing * scalar(wp.static(REACH))
@@ -33,7 +38,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         x = length / reach
         left = scalar(1.0) - x
         return vec3(
-            x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x)),
+            smoothstep(x),
             scalar(30.0) * x * x * left * left / reach,
             scalar(60.0) * x * left * (left - x) / (reach * reach),
         )
@@ -43,4 +48,4 @@ def functions(variant: Variant) -> SimpleNamespace:
         """1/l, and a finite number at l = 0, where s takes it away."""
         return scalar(1.0) / wp.max(length, spacing * scalar(wp.static(1.0e-6 * REACH)))
 
-    return SimpleNamespace(presence=presence, inverse_length=inverse_length)
+    return SimpleNamespace(smoothstep=smoothstep, presence=presence, inverse_length=inverse_length)

@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, Variant
 from . import mollifier
 
@@ -115,6 +116,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
     presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
@@ -178,7 +180,6 @@ def define(variant: Variant) -> wp.Kernel:
         crossing_neighbours: wp.array(dtype=wp.vec4i),
         corner_jams: wp.array(dtype=wp.vec4i),
         corner_blocks: wp.array(dtype=wp.vec4i),
-        stencil: int,
         # parameters
         shear: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
@@ -191,9 +192,7 @@ def define(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        upper_xx: wp.array(dtype=mat33),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         c = index(crossing_node[e])
@@ -254,7 +253,7 @@ def define(variant: Variant) -> wp.Kernel:
 
         if matrix != 0:
             # between two neighbours of the crossing, and of each with itself
-            h = weights[0][2]
+            h = blocks.coefficients[0][2]
             ul = wp.outer(g_ul, g_lu) * (h * k_lu)
             dl = wp.outer(g_dl, g_ld) * (h * k_ld)
             ur = wp.outer(g_ur, g_ru) * (h * k_ru)
@@ -268,20 +267,20 @@ def define(variant: Variant) -> wp.Kernel:
             rc = -(rr + wp.transpose(ur + dr))
             uc = -(uu + ul + ur)
             dc = -(dd + dl + dr)
-            wp.atomic_add(diagonal_xx, left, ll)
-            wp.atomic_add(diagonal_xx, right, rr)
-            wp.atomic_add(diagonal_xx, up, uu)
-            wp.atomic_add(diagonal_xx, down, dd)
-            wp.atomic_add(diagonal_xx, c, -(lc + rc + uc + dc))
-            wp.atomic_add(upper_xx, index(stencil * left), lc)
-            wp.atomic_add(upper_xx, index(stencil * c), wp.transpose(rc))
-            wp.atomic_add(upper_xx, index(stencil * up + 1), uc)
-            wp.atomic_add(upper_xx, index(stencil * c + 1), wp.transpose(dc))
-            blocks = corner_blocks[e]
-            wp.atomic_add(upper_xx, index(blocks[0]), ul)
-            wp.atomic_add(upper_xx, index(blocks[1]), wp.transpose(dl))
-            wp.atomic_add(upper_xx, index(blocks[2]), ur)
-            wp.atomic_add(upper_xx, index(blocks[3]), wp.transpose(dr))
+            wp.atomic_add(blocks.diagonal_xx, left, ll)
+            wp.atomic_add(blocks.diagonal_xx, right, rr)
+            wp.atomic_add(blocks.diagonal_xx, up, uu)
+            wp.atomic_add(blocks.diagonal_xx, down, dd)
+            wp.atomic_add(blocks.diagonal_xx, c, -(lc + rc + uc + dc))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * left), lc)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * c), wp.transpose(rc))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * up + 1), uc)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * c + 1), wp.transpose(dc))
+            slots = corner_blocks[e]
+            wp.atomic_add(blocks.upper_xx, index(slots[0]), ul)
+            wp.atomic_add(blocks.upper_xx, index(slots[1]), wp.transpose(dl))
+            wp.atomic_add(blocks.upper_xx, index(slots[2]), ur)
+            wp.atomic_add(blocks.upper_xx, index(slots[3]), wp.transpose(dr))
 
     return shear_term
 

@@ -13,7 +13,7 @@ from ..description.cloth import Cloth
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
 from ..kernels import TERMS, Term, Variant, build
-from ..kernels.linear import multilevel
+from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
 
 LARGE = 1 << 20
@@ -31,6 +31,7 @@ class Arrays(dict[str, Any]):
     def __init__(self, scene: Scene, variant: Variant, device: Any):
         super().__init__()
         self.scene, self.variant, self.device = scene, variant, device
+        self._empty: dict[Any, wp.array] = {}
         self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
@@ -45,7 +46,7 @@ class Arrays(dict[str, Any]):
         self._work()
         self.dims = {
             "nodes": self["nodes"],
-            "segments": len(self["segment_nodes"]),
+            "segments": len(self["segments"]),
             "bends": len(self["bend_nodes"]),
             "crossings": len(self["crossing_node"]),
             "triangles": len(self["triangle_nodes"]) if self["triangle_nodes"] is not None else 0,
@@ -71,12 +72,15 @@ class Arrays(dict[str, Any]):
         for name, values in vars(topology).items():
             if name == "neighbour":
                 values = np.ascontiguousarray(values[:, : self.stencil]).ravel()
-            if not isinstance(values, np.ndarray) or name == "node_yarns":
+            if not isinstance(values, np.ndarray) or name in ("node_yarns", "segment_nodes", "segment_yarn"):
                 continue
             dtype = vectors[1 if values.ndim == 1 else values.shape[1]]
             # on the CPU the same memory: nothing writes to either
             shared = {"dtype": dtype, "device": self.device, "copy": False}
             self[name] = None if name.startswith(skipped) else wp.array(values, **shared)
+        yarn = topology.segment_yarn
+        segments = np.column_stack([topology.segment_nodes, yarn, topology.yarn_direction[yarn]])
+        self["segments"] = wp.array(segments, dtype=wp.vec4i, device=self.device)
         free = np.ones(topology.nodes, dtype=np.int32)
         if self.scene.pin_stiffness is None:
             free[self.scene.pins] = 0
@@ -156,7 +160,7 @@ class Arrays(dict[str, Any]):
         self["counters"] = self.zeros(2, wp.int32)
         self["iterations"] = self.zeros(1, wp.int32)
         self["residual"] = self.zeros(1, scalar)
-        self["weights"] = self.zeros(1, vec3)
+        self["coefficients"] = self.zeros(1, vec3)
         self["step_size"] = self.zeros(1, scalar)
         self["remaining"] = self.zeros(1, scalar)
         self["stage_times"] = self.zeros(4, scalar)
@@ -167,7 +171,7 @@ class Arrays(dict[str, Any]):
         found = levels(self.scene.cloth.topology, self.stencil, free)
         unknowns = 4 if self.variant.sliding else 3
         scalar, vec3, mat33, sym33 = self.variant.scalar, self.variant.vec3, self.variant.mat33, self.variant.sym33
-        result = multilevel.structs(self.variant.forward).Levels()
+        result = structs(self.variant.forward).Levels()
         for name, values in vars(found).items():
             if isinstance(values, np.ndarray):
                 dtype = wp.int32 if values.dtype == np.int32 else scalar
@@ -177,7 +181,7 @@ class Arrays(dict[str, Any]):
                 setattr(result, name, values)
         coarse = found.coarse_nodes
         sizes = np.diff(found.level_start)
-        result.coarse_levels = len(sizes)
+        result.coarse_levels, result.blocks_per_node = len(sizes), BLOCKS
         result.exact = int(sizes[-1]) if coarse else 0
         for name, count, dtype in (
             ("coarse_block", BLOCKS * coarse, mat33),
@@ -239,11 +243,29 @@ class Arrays(dict[str, Any]):
         """Launches a kernel over elements, its arguments found by their names."""
         dim = self.dims[elements] if isinstance(elements, str) else elements
         if dim:
-            inputs = [replaced[a.label] if a.label in replaced else self.find(a.label) for a in kernel.adj.args]
+            inputs = [self._argument(a.label, a.type, replaced) for a in kernel.adj.args]
             wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
+    def _argument(self, label: str, kind: Any, replaced: dict[str, Any]) -> Any:
+        """What a kernel's argument is launched with; the fields of a struct are found as arguments are."""
+        if label in replaced:
+            return replaced[label]
+        if not isinstance(kind, wp._src.codegen.Struct) or label in self:
+            return self.find(label)
+        result = kind()
+        for name, field in kind.vars.items():
+            value = self._argument(name, field.type, replaced)
+            setattr(result, name, self._nothing(field.type.dtype) if value is None else value)
+        return result
+
+    def _nothing(self, dtype: Any) -> wp.array:
+        """An array of no length: reverse mode knows no struct with None in it."""
+        if dtype not in self._empty:
+            self._empty[dtype] = self.zeros(0, dtype)
+        return self._empty[dtype]
+
     def find(self, label: str) -> Any:
-        """What a kernel's argument of this name stands for; ``x_grad`` is the gradient of ``x``."""
+        """What an array's name stands for; ``x_grad`` is the gradient of ``x``."""
         if label.endswith("_grad"):
             array = self[label.removesuffix("_grad")]
             return None if array is None else array.grad
@@ -255,3 +277,12 @@ class Arrays(dict[str, Any]):
             array = self[name]
             still = array is None or (name == "euler" and not self.variant.sliding)
             self[f"frame_{name}"] = None if still else self.zeros(count * array.shape[0], array.dtype)
+
+
+def arrays_of(launch: Any) -> list[wp.array]:
+    """List the arrays that a launch on a tape was given, those in structs among them."""
+    result = []
+    for value in launch[3]:
+        fields = [getattr(value, name) for name in value._cls.vars] if hasattr(value, "_cls") else [value]
+        result += [field for field in fields if isinstance(field, wp.array)]
+    return result

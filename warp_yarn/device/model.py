@@ -215,7 +215,7 @@ class Model:
         a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)), begun)
         a.put("step_size", step)
         a.put("remaining", remaining)
-        a.put("weights", 1.0, stage, stage * stage)
+        a.put("coefficients", 1.0, stage, stage * stage)
 
     def launch(self, kernel: str, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel by its name (see ``Arrays.launch``)."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from ..device.arrays import STATE_TYPES
+from ..device.arrays import STATE_TYPES, arrays_of
 from ..device.model import PATHS
 from ..errors import GradientError, InputError
 from ..kernels.core.status import NOT_FINITE
@@ -111,7 +111,7 @@ class Adjoint:
     def _blame(self) -> str | None:
         """The kernel whose reverse first writes something that is not finite, in the step that is on the device."""
         for launch in reversed(self.simulator.integrator.tape.launches):
-            gradients = [array.grad for array in launch[3] if isinstance(array, wp.array) and array.grad is not None]
+            gradients = [array.grad for array in arrays_of(launch) if array.grad is not None]
             if any(not np.isfinite(gradient.numpy()).all() for gradient in gradients):
                 return launch[0].key
         return None

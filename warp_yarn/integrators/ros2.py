@@ -126,5 +126,8 @@ class ROS2(LinearlyImplicitEuler):
         self._assemble_first()
         a.zero_grad(*BETWEEN)
         model.launch("first_stage_adjoint", "nodes")
+        # λ starts at 0, and w is that of the first stage
+        a.zero_grad("rhs", "euler_rhs")
+        model.copy(solution="first_solution", euler_solution="euler_first_solution")
         self._solve()
         self.tape.backward()

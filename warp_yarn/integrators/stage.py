@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from ..device.arrays import arrays_of
 from ..device.model import BETWEEN, Graphs, Model
 from ..kernels.core.status import STALLED
 
@@ -440,7 +441,7 @@ class StageMethod:
     def _arrays_added_to(self) -> tuple[str, ...]:
         """Arrays whose gradients reverse mode adds to: the stage's own, friction's anchors and the parameters."""
         between = {*BETWEEN, "rhs", "euler_rhs"}
-        arrays = (array for launch in self.tape.launches for array in launch[3] if isinstance(array, wp.array))
+        arrays = (array for launch in self.tape.launches for array in arrays_of(launch))
         pointers = {array.ptr for array in arrays if array.grad is not None}
         a = self.model.arrays
         return tuple(

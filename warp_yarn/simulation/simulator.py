@@ -645,7 +645,7 @@ class Simulator:
         """
         h = self.step_size
         with _Visit(self, state, ahead=True):
-            self.arrays.put("weights", *(weights or (1.0, h, h * h)))
+            self.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return gather(self.model)
 
