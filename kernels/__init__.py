@@ -55,7 +55,10 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
     # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does by itself, one
     # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
-    kernels = {"contact_normal": crossing_normal.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
+    kernels = {
+        "contact_normal": crossing_normal.define_normal(variant),
+        "update_anchor": friction.define_anchor(variant),
+    }
     for term in TERMS.values():
         kernels[term.name] = term.define(variant)
         if term.energy is not None:

@@ -21,3 +21,10 @@ def ends(segments: wp.array(dtype=wp.vec4i), e: int):
     b = index(segment[1])
     direction = index(segment[3])
     return a, b, 2 * a + direction, 2 * b + direction, index(segment[2]), direction
+
+
+@wp.func
+def coordinates(segments: wp.array(dtype=wp.vec4i), e: int):
+    """Look up where the coordinates of a segment's two ends stand, along its yarn."""
+    segment = segments[e]
+    return index(2 * segment[0] + segment[3]), index(2 * segment[1] + segment[3])

@@ -79,5 +79,5 @@ class Term:
     sliding_only: bool = False
     """Whether the term vanishes identically where yarns do not slide."""
     presses: bool = False
-    """Whether the term presses yarns together (eq. 3): its kernel then adds to ``contact_load`` where ``press`` is not
-    0. Such terms stand before those that need the contact."""
+    """Whether the term presses yarns together (eq. 3): its kernel then adds to ``contact_load`` where
+    ``add_contact_load`` is not 0. Such terms stand before those that need the contact."""

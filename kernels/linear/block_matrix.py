@@ -108,7 +108,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     vec5 = wp.types.vector(5, scalar)
-    at, put = memory.functions(variant).at, memory.functions(variant).put
+    load, store = memory.functions(variant).load, memory.functions(variant).store
     BlockMatrix, SolveReport = structs(variant).BlockMatrix, structs(variant).SolveReport
 
     @wp.func
@@ -161,18 +161,22 @@ def functions(variant: Variant) -> SimpleNamespace:
         u = scalar(0.0)
         v = scalar(0.0)
         for i in range(nodes):
-            x = at(p_x, i)
+            x = load(p_x, i)
             y, y_u, y_v = gather(i, blocks, p_x, p_s)
-            y += times(at(blocks.diagonal_xx, i), x)
+            y += times(load(blocks.diagonal_xx, i), x)
             if wp.static(sliding):
-                u = at(p_s, 2 * i)
-                v = at(p_s, 2 * i + 1)
-                xs_u = at(blocks.diagonal_xs, 2 * i)
-                xs_v = at(blocks.diagonal_xs, 2 * i + 1)
+                u = load(p_s, 2 * i)
+                v = load(p_s, 2 * i + 1)
+                xs_u = load(blocks.diagonal_xs, 2 * i)
+                xs_v = load(blocks.diagonal_xs, 2 * i + 1)
                 y += xs_u * u + xs_v * v
-                put(q_s, 2 * i, at(q_s, 2 * i) + y_u + wp.dot(xs_u, x) + at(blocks.diagonal_ss, 2 * i) * u)
-                put(q_s, 2 * i + 1, at(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + at(blocks.diagonal_ss, 2 * i + 1) * v)
-            put(q_x, i, at(q_x, i) + y)
+                store(q_s, 2 * i, load(q_s, 2 * i) + y_u + wp.dot(xs_u, x) + load(blocks.diagonal_ss, 2 * i) * u)
+                store(
+                    q_s,
+                    2 * i + 1,
+                    load(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + load(blocks.diagonal_ss, 2 * i + 1) * v,
+                )
+            store(q_x, i, load(q_x, i) + y)
             spread(i, blocks, -x, -u, -v, q_x, q_s)
 
     @wp.func
@@ -190,7 +194,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     multiply, write_report = functions(variant).multiply, functions(variant).write_report
     module = variant.module("solver")
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork

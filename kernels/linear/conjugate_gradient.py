@@ -29,10 +29,10 @@ from .threads import call, ended, keep_pace, meet, share, wait_for_call
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, mat33, sym33, sliding = (
-        variant.scalar, variant.vec3, variant.mat33, variant.sym33, variant.sliding,
+    scalar, vec3, sym33, sliding = (
+        variant.scalar, variant.vec3, variant.sym33, variant.sliding,
     )  # fmt: skip
-    at, put = memory.functions(variant).at, memory.functions(variant).put
+    load, store = memory.functions(variant).load, memory.functions(variant).store
     times, gather, spread = (getattr(block_matrix.functions(variant), name) for name in ("times", "gather", "spread"))
     write_report = block_matrix.functions(variant).write_report
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
@@ -73,29 +73,29 @@ def define(variant: Variant) -> SimpleNamespace:
                     keep_pace(team, strip, strip + 1, strip - 1, strips, width - 1 - column, width, swept + row)
                 i = begin + column
                 w, w_u, w_v = gather(i, blocks, work.t_x, work.t_s)
-                p = at(work.r_x, i) + at(work.p_x, i) * beta
-                t = product(at(inverse_pivot, i), p - w)
-                q = w + product(symmetric(at(blocks.diagonal_xx, i)), t)
-                put(work.p_x, i, p)
-                put(work.t_x, i, t)
+                p = load(work.r_x, i) + load(work.p_x, i) * beta
+                t = product(load(inverse_pivot, i), p - w)
+                q = w + product(symmetric(load(blocks.diagonal_xx, i)), t)
+                store(work.p_x, i, p)
+                store(work.t_x, i, t)
                 if wp.static(sliding):
-                    p_u = at(work.r_s, 2 * i) + at(work.p_s, 2 * i) * beta
-                    p_v = at(work.r_s, 2 * i + 1) + at(work.p_s, 2 * i + 1) * beta
-                    u = at(inverse_s, 2 * i) * (p_u - w_u)
-                    v = at(inverse_s, 2 * i + 1) * (p_v - w_v)
-                    xs_u = at(blocks.diagonal_xs, 2 * i)
-                    xs_v = at(blocks.diagonal_xs, 2 * i + 1)
+                    p_u = load(work.r_s, 2 * i) + load(work.p_s, 2 * i) * beta
+                    p_v = load(work.r_s, 2 * i + 1) + load(work.p_s, 2 * i + 1) * beta
+                    u = load(inverse_s, 2 * i) * (p_u - w_u)
+                    v = load(inverse_s, 2 * i + 1) * (p_v - w_v)
+                    xs_u = load(blocks.diagonal_xs, 2 * i)
+                    xs_v = load(blocks.diagonal_xs, 2 * i + 1)
                     q += xs_u * u + xs_v * v
-                    q_u = w_u + wp.dot(xs_u, t) + at(blocks.diagonal_ss, 2 * i) * u
-                    q_v = w_v + wp.dot(xs_v, t) + at(blocks.diagonal_ss, 2 * i + 1) * v
-                    put(work.p_s, 2 * i, p_u)
-                    put(work.p_s, 2 * i + 1, p_v)
-                    put(work.t_s, 2 * i, u)
-                    put(work.t_s, 2 * i + 1, v)
-                    put(work.q_s, 2 * i, q_u)
-                    put(work.q_s, 2 * i + 1, q_v)
+                    q_u = w_u + wp.dot(xs_u, t) + load(blocks.diagonal_ss, 2 * i) * u
+                    q_v = w_v + wp.dot(xs_v, t) + load(blocks.diagonal_ss, 2 * i + 1) * v
+                    store(work.p_s, 2 * i, p_u)
+                    store(work.p_s, 2 * i + 1, p_v)
+                    store(work.t_s, 2 * i, u)
+                    store(work.t_s, 2 * i + 1, v)
+                    store(work.q_s, 2 * i, q_u)
+                    store(work.q_s, 2 * i + 1, q_v)
                     curvature += u * (q_u + w_u) + v * (q_v + w_v)
-                put(work.q_x, i, q)
+                store(work.q_x, i, q)
                 curvature += wp.dot(t, q + w)
                 column -= 1
             if strips > 1:
@@ -131,30 +131,30 @@ def define(variant: Variant) -> SimpleNamespace:
                 if strips > 1:
                     keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
                 i = begin + column
-                inverse = at(inverse_pivot, i)
-                t = at(work.t_x, i)
-                q = at(work.q_x, i)
+                inverse = load(inverse_pivot, i)
+                t = load(work.t_x, i)
+                q = load(work.q_x, i)
                 if wp.static(sliding):
-                    inverse_u = at(inverse_s, 2 * i)
-                    inverse_v = at(inverse_s, 2 * i + 1)
-                    u = at(work.t_s, 2 * i)
-                    v = at(work.t_s, 2 * i + 1)
-                    q_u = at(work.q_s, 2 * i)
-                    q_v = at(work.q_s, 2 * i + 1)
+                    inverse_u = load(inverse_s, 2 * i)
+                    inverse_v = load(inverse_s, 2 * i + 1)
+                    u = load(work.t_s, 2 * i)
+                    v = load(work.t_s, 2 * i + 1)
+                    q_u = load(work.q_s, 2 * i)
+                    q_v = load(work.q_s, 2 * i + 1)
                     y_u = inverse_u * q_u - u
                     y_v = inverse_v * q_v - v
-                    put(euler_solution, 2 * i, at(euler_solution, 2 * i) + u * alpha)
-                    put(euler_solution, 2 * i + 1, at(euler_solution, 2 * i + 1) + v * alpha)
-                    r_u = at(work.r_s, 2 * i) - q_u * alpha
-                    r_v = at(work.r_s, 2 * i + 1) - q_v * alpha
-                    put(work.r_s, 2 * i, r_u)
-                    put(work.r_s, 2 * i + 1, r_v)
+                    store(euler_solution, 2 * i, load(euler_solution, 2 * i) + u * alpha)
+                    store(euler_solution, 2 * i + 1, load(euler_solution, 2 * i + 1) + v * alpha)
+                    r_u = load(work.r_s, 2 * i) - q_u * alpha
+                    r_v = load(work.r_s, 2 * i + 1) - q_v * alpha
+                    store(work.r_s, 2 * i, r_u)
+                    store(work.r_s, 2 * i + 1, r_v)
                     rz += r_u * inverse_u * r_u + r_v * inverse_v * r_v
                 y = product(inverse, q) - t
                 spread(i, blocks, y, y_u, y_v, work.q_x, work.q_s)
-                put(solution, i, at(solution, i) + t * alpha)
-                r = at(work.r_x, i) - q * alpha
-                put(work.r_x, i, r)
+                store(solution, i, load(solution, i) + t * alpha)
+                r = load(work.r_x, i) - q * alpha
+                store(work.r_x, i, r)
                 rz += wp.dot(r, product(inverse, r))
                 column += 1
             if strips > 1:
@@ -210,14 +210,14 @@ def define(variant: Variant) -> SimpleNamespace:
             swept = team[16 + 16 * strip]
             start = zero
             for i in range(begin, end):
-                put(work.r_x, i, at(rhs, i))
-                put(work.p_x, i, vec3())
-                start += wp.dot(at(solution, i), at(solution, i))
+                store(work.r_x, i, load(rhs, i))
+                store(work.p_x, i, vec3())
+                start += wp.dot(load(solution, i), load(solution, i))
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        put(work.r_s, s, at(euler_rhs, s))
-                        put(work.p_s, s, zero)
-                        start += at(euler_solution, s) * at(euler_solution, s)
+                        store(work.r_s, s, load(euler_rhs, s))
+                        store(work.p_s, s, zero)
+                        start += load(euler_solution, s) * load(euler_solution, s)
             start = total(start, 0, strip, strips, met, team, work.sums)
             # r = E (E + U)⁻ᵀ (b − A x)
             rz = zero
@@ -231,32 +231,35 @@ def define(variant: Variant) -> SimpleNamespace:
                     if strips > 1:
                         keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
                     i = row * columns + first + column
-                    inverse = at(inverse_pivot, i)
+                    inverse = load(inverse_pivot, i)
                     x = vec3()
-                    r = at(work.r_x, i)
+                    r = load(work.r_x, i)
                     if start != zero:
-                        x = at(solution, i)
-                        w, w_u, w_v = gather(
-                            i, blocks, solution, euler_solution
-                        )
-                        r -= w + times(at(blocks.diagonal_xx, i), x)
+                        x = load(solution, i)
+                        w, w_u, w_v = gather(i, blocks, solution, euler_solution)
+                        r -= w + times(load(blocks.diagonal_xx, i), x)
                         if wp.static(sliding):
-                            u = at(euler_solution, 2 * i)
-                            v = at(euler_solution, 2 * i + 1)
-                            xs_u = at(blocks.diagonal_xs, 2 * i)
-                            xs_v = at(blocks.diagonal_xs, 2 * i + 1)
+                            u = load(euler_solution, 2 * i)
+                            v = load(euler_solution, 2 * i + 1)
+                            xs_u = load(blocks.diagonal_xs, 2 * i)
+                            xs_v = load(blocks.diagonal_xs, 2 * i + 1)
                             r -= xs_u * u + xs_v * v
-                            r_u = at(work.r_s, 2 * i) - w_u - wp.dot(xs_u, x) - at(blocks.diagonal_ss, 2 * i) * u
-                            r_v = at(work.r_s, 2 * i + 1) - w_v - wp.dot(xs_v, x) - at(blocks.diagonal_ss, 2 * i + 1) * v
-                            put(work.r_s, 2 * i, r_u)
-                            put(work.r_s, 2 * i + 1, r_v)
-                        put(work.r_x, i, r)
+                            r_u = load(work.r_s, 2 * i) - w_u - wp.dot(xs_u, x) - load(blocks.diagonal_ss, 2 * i) * u
+                            r_v = (
+                                load(work.r_s, 2 * i + 1)
+                                - w_v
+                                - wp.dot(xs_v, x)
+                                - load(blocks.diagonal_ss, 2 * i + 1) * v
+                            )
+                            store(work.r_s, 2 * i, r_u)
+                            store(work.r_s, 2 * i + 1, r_v)
+                        store(work.r_x, i, r)
                     y = product(inverse, r)
                     rz += wp.dot(r, y)
                     if wp.static(sliding):
-                        y_u = at(inverse_s, 2 * i) * at(work.r_s, 2 * i)
-                        y_v = at(inverse_s, 2 * i + 1) * at(work.r_s, 2 * i + 1)
-                        rz += at(work.r_s, 2 * i) * y_u + at(work.r_s, 2 * i + 1) * y_v
+                        y_u = load(inverse_s, 2 * i) * load(work.r_s, 2 * i)
+                        y_v = load(inverse_s, 2 * i + 1) * load(work.r_s, 2 * i + 1)
+                        rz += load(work.r_s, 2 * i) * y_u + load(work.r_s, 2 * i + 1) * y_v
                     # what is held has y = 0 and gives others its x alone
                     spread(
                         i, blocks,
@@ -300,7 +303,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 if write_report(count, rz, size, limit, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
-                        here = wp.dot(at(work.r_x, i), product(at(inverse_pivot, i), at(work.r_x, i)))
+                        here = wp.dot(load(work.r_x, i), product(load(inverse_pivot, i), load(work.r_x, i)))
                         if not (here <= worst):
                             worst = here
                             report.status[1] = i

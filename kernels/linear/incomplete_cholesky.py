@@ -88,7 +88,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, mat33, sym33 = variant.scalar, variant.mat33, variant.sym33
-    at, put = memory.functions(variant).at, memory.functions(variant).put
+    load, store = memory.functions(variant).load, memory.functions(variant).store
     symmetric, correct = functions(variant).symmetric, functions(variant).correct
     inverse_of = functions(variant).inverse_of
     variant.fuse("incomplete")
@@ -109,15 +109,15 @@ def define(variant: Variant) -> SimpleNamespace:
         iterations by less than one.
         """
         for i in range(nodes):
-            put(inverse_pivot, i, symmetric(at(diagonal_xx, i)))
+            store(inverse_pivot, i, symmetric(load(diagonal_xx, i)))
         for i in range(nodes):
             inverse = sym33()
             if is_free[i] != 0:
-                inverse = inverse_of(at(inverse_pivot, i))
+                inverse = inverse_of(load(inverse_pivot, i))
                 if inverse[0] <= scalar(0.0):
                     # What was dropped made it indefinite: any positive definite E will do, so take the block itself.
                     inverse = symmetric(wp.inverse(diagonal_xx[i]))
                 correct(inverse, i, stencil, neighbour, upper_xx, inverse_pivot)
-            put(inverse_pivot, i, inverse)
+            store(inverse_pivot, i, inverse)
 
     return SimpleNamespace(factorize=factorize)

@@ -92,7 +92,7 @@ _ROW = (
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
-    at, put = memory.functions(variant).at, memory.functions(variant).put
+    load, store = memory.functions(variant).load, memory.functions(variant).store
     write_report = block_matrix.functions(variant).write_report
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
     SolveReport, Levels = structs(variant).SolveReport, structs(variant).Levels
@@ -127,19 +127,19 @@ def define(variant: Variant) -> SimpleNamespace:
         """A block of RᵀAR of a level, those of the level below being there."""
         block = levels.blocks_per_node * first + wp.tid()
         result = mat33()
-        for k in range(at(levels.block_start, block), at(levels.block_start, block + 1)):
-            source = at(levels.part, k)
-            weight = at(levels.part_weight, k)
+        for k in range(load(levels.block_start, block), load(levels.block_start, block + 1)):
+            source = load(levels.part, k)
+            weight = load(levels.part_weight, k)
             turned = source < 0
             if turned:
                 source = -1 - source
             m = mat33()
             if first > 0:
-                m = at(levels.coarse_block, source)
+                m = load(levels.coarse_block, source)
             elif source < nodes:
-                m = at(blocks.diagonal_xx, source)
+                m = load(blocks.diagonal_xx, source)
             else:
-                m = at(blocks.upper_xx, source - nodes)
+                m = load(blocks.upper_xx, source - nodes)
             if turned:
                 m = wp.transpose(m)
             result += m * weight
@@ -156,8 +156,8 @@ def define(variant: Variant) -> SimpleNamespace:
         """Every line of the cloth along one direction; warp yarns come first."""
         k = wp.tid() + direction * levels.warp_lines
         factorize_nodes(
-            direction, at(levels.line_start, k), at(levels.line_start, k + 1), levels.line_node, blocks, is_free, is_crossing,
-            levels.line_factor, levels.halves,
+            direction, load(levels.line_start, k), load(levels.line_start, k + 1), levels.line_node,
+            blocks, is_free, is_crossing, levels.line_factor, levels.halves,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
@@ -165,8 +165,9 @@ def define(variant: Variant) -> SimpleNamespace:
         """Every line of the coarse levels along one direction."""
         k = wp.tid() + direction * levels.coarse_warp_lines
         factorize_coarse(
-            direction, at(levels.coarse_line_start, k), at(levels.coarse_line_start, k + 1), levels.coarse_line_node,
-            levels.blocks_per_node, levels.coarse_block, levels.coarse_line_factor, levels.coarse_halves,
+            direction, load(levels.coarse_line_start, k), load(levels.coarse_line_start, k + 1),
+            levels.coarse_line_node, levels.blocks_per_node,
+            levels.coarse_block, levels.coarse_line_factor, levels.coarse_halves,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
@@ -176,24 +177,24 @@ def define(variant: Variant) -> SimpleNamespace:
         lower = levels.coarsest
         for i in range(count):
             for j in range(i, count):
-                slot = at(levels.coarsest_slot, count * i + j)
+                slot = load(levels.coarsest_slot, count * i + j)
                 block = mat33()
                 if slot >= 0:
-                    block = at(levels.coarse_block, levels.blocks_per_node * (first + i) + slot)
+                    block = load(levels.coarse_block, levels.blocks_per_node * (first + i) + slot)
                 for k in range(3):
                     for m in range(3):
-                        put(lower, size * (3 * j + m) + 3 * i + k, block[k, m])
+                        store(lower, size * (3 * j + m) + 3 * i + k, block[k, m])
         for j in range(size):
-            diagonal = at(lower, size * j + j)
+            diagonal = load(lower, size * j + j)
             for i in range(j, size):
-                value = at(lower, size * i + j)
+                value = load(lower, size * i + j)
                 for k in range(j):
-                    value -= at(lower, size * i + k) * at(lower, size * j + k)
+                    value -= load(lower, size * i + k) * load(lower, size * j + k)
                 if i == j:
                     safe = diagonal > scalar(0.0) and value > scalar(wp.static(SAFE[scalar])) * diagonal
-                    put(lower, size * j + j, wp.where(safe, scalar(1.0) / wp.sqrt(value), scalar(0.0)))
+                    store(lower, size * j + j, wp.where(safe, scalar(1.0) / wp.sqrt(value), scalar(0.0)))
                 else:
-                    put(lower, size * i + j, value * at(lower, size * j + j))
+                    store(lower, size * i + j, value * load(lower, size * j + j))
 
     @wp.func
     def solve_coarsest(levels: Levels, first: int, count: int):
@@ -201,37 +202,37 @@ def define(variant: Variant) -> SimpleNamespace:
         size = 3 * count
         for i in range(size):
             node = first + i / 3
-            value = at(levels.coarse_r, node)[i % 3]
+            value = load(levels.coarse_r, node)[i % 3]
             for k in range(i):
-                value -= at(levels.coarsest, size * i + k) * at(levels.coarse_z, first + k / 3)[k % 3]
-            value *= at(levels.coarsest, size * i + i)
+                value -= load(levels.coarsest, size * i + k) * load(levels.coarse_z, first + k / 3)[k % 3]
+            value *= load(levels.coarsest, size * i + i)
             levels.coarse_z[node][i % 3] = value
         for c in range(size):
             i = size - 1 - c
             node = first + i / 3
-            value = at(levels.coarse_z, node)[i % 3]
+            value = load(levels.coarse_z, node)[i % 3]
             for k in range(i + 1, size):
-                value -= at(levels.coarsest, size * k + i) * at(levels.coarse_z, first + k / 3)[k % 3]
-            levels.coarse_z[node][i % 3] = value * at(levels.coarsest, size * i + i)
+                value -= load(levels.coarsest, size * k + i) * load(levels.coarse_z, first + k / 3)[k % 3]
+            levels.coarse_z[node][i % 3] = value * load(levels.coarsest, size * i + i)
 
     @wp.func
     def restrict(levels: Levels, below: wp.array(dtype=vec3), begin: int, end: int):
         """r of coarse nodes from the level below, and the start of their z."""
         for i in range(begin, end):
             r = vec3()
-            for k in range(at(levels.child_start, i), at(levels.child_start, i + 1)):
-                r += at(below, at(levels.child, k)) * at(levels.child_weight, k)
-            put(levels.coarse_r, i, r)
-            put(levels.coarse_z, i, -product(at(levels.coarse_halves, i), r))
+            for k in range(load(levels.child_start, i), load(levels.child_start, i + 1)):
+                r += load(below, load(levels.child, k)) * load(levels.child_weight, k)
+            store(levels.coarse_r, i, r)
+            store(levels.coarse_z, i, -product(load(levels.coarse_halves, i), r))
 
     @wp.func
     def interpolated(levels: Levels, i: int) -> vec3:
         """z of a node's parents at the node; ``i`` counts the cloth's nodes and then coarse ones."""
         result = vec3()
         for k in range(4 * i, 4 * i + 4):
-            j = at(levels.parent, k)
+            j = load(levels.parent, k)
             if j >= 0:
-                result += at(levels.coarse_z, j) * at(levels.parent_weight, k)
+                result += load(levels.coarse_z, j) * load(levels.parent_weight, k)
         return result
 
     @wp.func
@@ -245,8 +246,8 @@ def define(variant: Variant) -> SimpleNamespace:
             if strips > 1:
                 met += strips
                 meet(team, met)
-            first = at(levels.level_start, level)
-            size = at(levels.level_start, level + 1) - first
+            first = load(levels.level_start, level)
+            size = load(levels.level_start, level + 1) - first
             begin = first + share(size, strip, strips)
             end = first + share(size, strip + 1, strips)
             if level == 0:
@@ -261,7 +262,7 @@ def define(variant: Variant) -> SimpleNamespace:
             size = wp.where(direction == 0, levels.warp_lines, levels.line_start.shape[0] - 1 - levels.warp_lines)
             for k in range(first + share(size, strip, strips), first + share(size, strip + 1, strips)):
                 solve_nodes(
-                    direction, at(levels.line_start, k), at(levels.line_start, k + 1), levels.line_node,
+                    direction, load(levels.line_start, k), load(levels.line_start, k + 1), levels.line_node,
                     levels.line_factor, levels.line_work, r_x, r_s, z_x, z_s,
                 )  # fmt: skip
             first = direction * levels.coarse_warp_lines
@@ -272,31 +273,31 @@ def define(variant: Variant) -> SimpleNamespace:
             )
             for k in range(first + share(size, strip, strips), first + share(size, strip + 1, strips)):
                 solve_coarse(
-                    direction, at(levels.coarse_line_start, k), at(levels.coarse_line_start, k + 1),
+                    direction, load(levels.coarse_line_start, k), load(levels.coarse_line_start, k + 1),
                     levels.coarse_line_node, levels.coarse_line_factor, levels.coarse_line_work,
                     levels.coarse_r, levels.coarse_z,
                 )  # fmt: skip
         if strip == 0 and levels.exact > 0:
-            solve_coarsest(levels, at(levels.level_start, count - 1), levels.exact)
+            solve_coarsest(levels, load(levels.level_start, count - 1), levels.exact)
         for k in range(count - 1):
             if strips > 1:
                 met += strips
                 meet(team, met)
             level = count - 2 - k
-            first = at(levels.level_start, level)
-            size = at(levels.level_start, level + 1) - first
+            first = load(levels.level_start, level)
+            size = load(levels.level_start, level + 1) - first
             for i in range(first + share(size, strip, strips), first + share(size, strip + 1, strips)):
-                put(levels.coarse_z, i, at(levels.coarse_z, i) + interpolated(levels, nodes + i))
+                store(levels.coarse_z, i, load(levels.coarse_z, i) + interpolated(levels, nodes + i))
         if strips > 1:
             met += strips
             meet(team, met)
         rz = scalar(0.0)
         for i in range(share(nodes, strip, strips), share(nodes, strip + 1, strips)):
-            z = at(z_x, i) + interpolated(levels, i)
-            put(z_x, i, z)
-            rz += wp.dot(at(r_x, i), z)
+            z = load(z_x, i) + interpolated(levels, i)
+            store(z_x, i, z)
+            rz += wp.dot(load(r_x, i), z)
             if wp.static(sliding):
-                rz += at(r_s, 2 * i) * at(z_s, 2 * i) + at(r_s, 2 * i + 1) * at(z_s, 2 * i + 1)
+                rz += load(r_s, 2 * i) * load(z_s, 2 * i) + load(r_s, 2 * i + 1) * load(z_s, 2 * i + 1)
         return rz
 
     @wp.func
@@ -350,14 +351,14 @@ def define(variant: Variant) -> SimpleNamespace:
                 unused += multiply_row(
                     i, blocks, levels.lower, solution, euler_solution, work.q_x, work.q_s,
                 )  # fmt: skip
-                r = at(rhs, i) - at(work.q_x, i)
-                put(work.r_x, i, r)
-                put(work.p_x, i, vec3())
-                put(work.t_x, i, -product(at(levels.halves, i), r))
+                r = load(rhs, i) - load(work.q_x, i)
+                store(work.r_x, i, r)
+                store(work.p_x, i, vec3())
+                store(work.t_x, i, -product(load(levels.halves, i), r))
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        put(work.r_s, s, at(euler_rhs, s) - at(work.q_s, s))
-                        put(work.p_s, s, zero)
+                        store(work.r_s, s, load(euler_rhs, s) - load(work.q_s, s))
+                        store(work.p_s, s, zero)
             rz = precondition(strip, strips, met, team, nodes, levels, work.r_x, work.r_s, work.t_x, work.t_s)
             met += strips * (meetings(levels) + 1)
             rz = total(rz, 0, strip, strips, met, team, work.sums)
@@ -367,10 +368,10 @@ def define(variant: Variant) -> SimpleNamespace:
             beta = zero
             while count < most_iterations and rz > limit:
                 for i in range(begin, end):
-                    put(work.p_x, i, at(work.t_x, i) + at(work.p_x, i) * beta)
+                    store(work.p_x, i, load(work.t_x, i) + load(work.p_x, i) * beta)
                     if wp.static(sliding):
-                        put(work.p_s, 2 * i, at(work.t_s, 2 * i) + at(work.p_s, 2 * i) * beta)
-                        put(work.p_s, 2 * i + 1, at(work.t_s, 2 * i + 1) + at(work.p_s, 2 * i + 1) * beta)
+                        store(work.p_s, 2 * i, load(work.t_s, 2 * i) + load(work.p_s, 2 * i) * beta)
+                        store(work.p_s, 2 * i + 1, load(work.t_s, 2 * i + 1) + load(work.p_s, 2 * i + 1) * beta)
                 if strips > 1:
                     met += strips
                     meet(team, met)
@@ -386,14 +387,14 @@ def define(variant: Variant) -> SimpleNamespace:
                     break
                 alpha = rz / curvature
                 for i in range(begin, end):
-                    put(solution, i, at(solution, i) + at(work.p_x, i) * alpha)
-                    r = at(work.r_x, i) - at(work.q_x, i) * alpha
-                    put(work.r_x, i, r)
-                    put(work.t_x, i, -product(at(levels.halves, i), r))
+                    store(solution, i, load(solution, i) + load(work.p_x, i) * alpha)
+                    r = load(work.r_x, i) - load(work.q_x, i) * alpha
+                    store(work.r_x, i, r)
+                    store(work.t_x, i, -product(load(levels.halves, i), r))
                     if wp.static(sliding):
                         for s in range(2 * i, 2 * i + 2):
-                            put(euler_solution, s, at(euler_solution, s) + at(work.p_s, s) * alpha)
-                            put(work.r_s, s, at(work.r_s, s) - at(work.q_s, s) * alpha)
+                            store(euler_solution, s, load(euler_solution, s) + load(work.p_s, s) * alpha)
+                            store(work.r_s, s, load(work.r_s, s) - load(work.q_s, s) * alpha)
                 rz_next = precondition(strip, strips, met, team, nodes, levels, work.r_x, work.r_s, work.t_x, work.t_s)
                 met += strips * (meetings(levels) + 1)
                 rz_next = total(rz_next, 2 + count % 2, strip, strips, met, team, work.sums)
@@ -406,7 +407,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 if write_report(count, rz, size, limit, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
-                        here = wp.dot(at(work.r_x, i), at(work.t_x, i))
+                        here = wp.dot(load(work.r_x, i), load(work.t_x, i))
                         if not (here <= worst):
                             worst = here
                             report.status[1] = i

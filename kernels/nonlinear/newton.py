@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import ends, index
+from ..core.indexing import coordinates, ends, index
 from ..core.memory import functions as access
 from ..core.status import NOT_FINITE, ORDER_LOST, STALLED, fail
 from ..core.structs import structs
@@ -52,7 +52,7 @@ COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
-    at, put = access(variant).at, access(variant).put
+    load, store = access(variant).load, access(variant).store
     NewtonControl = structs(variant).NewtonControl
     module = variant.module("stage")
 
@@ -87,26 +87,26 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_increment[s] = base_euler_velocity[s] - rate
 
     @wp.kernel(module=module, enable_backward=False)
-    def look_ahead(
+    def check_initial_guess(
         segments: wp.array(dtype=wp.vec4i),
         stage_size: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
         base_euler: wp.array(dtype=scalar),
         euler_solution: wp.array(dtype=scalar),
-        crosses: wp.array(dtype=int),
+        order_would_be_lost: wp.array(dtype=int),
         status: wp.array(dtype=int),
     ):
         """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
         has them much nearer to each other than the first stage left them."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, _b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
         rest = base_euler[sb] - base_euler[sa]
         if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
-            crosses[0] = 1
+            order_would_be_lost[0] = 1
         if rest < scalar(EXTRAPOLATED) * (euler[sb] - euler[sa]):
             fail(status, wp.static(ORDER_LOST), a)
 
     @wp.kernel(module=module, enable_backward=False)
-    def correct(
+    def apply_step(
         step_length: wp.array(dtype=scalar),
         solution_before: wp.array(dtype=vec3),
         euler_solution_before: wp.array(dtype=scalar),
@@ -131,7 +131,7 @@ def define(variant: Variant) -> SimpleNamespace:
         node_mass: wp.array(dtype=scalar),
     ):
         """Half of every segment's mass to each of its nodes."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         m = scalar(0.5) * density[yarn] * (euler[sb] - euler[sa])
         wp.atomic_add(node_mass, a, m)
         wp.atomic_add(node_mass, b, m)
@@ -147,13 +147,13 @@ def define(variant: Variant) -> SimpleNamespace:
         momentum = vec3()
         mass = scalar(0.0)
         for i in range(nodes):
-            momentum += at(rhs, i)
-            mass += at(node_mass, i)
+            momentum += load(rhs, i)
+            mass += load(node_mass, i)
         for i in range(nodes):
-            put(direction, i, momentum / mass)
+            store(direction, i, momentum / mass)
 
     @wp.kernel(module=module, enable_backward=False)
-    def search(
+    def begin_line_search(
         nodes: int,
         node_mass: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
@@ -172,25 +172,25 @@ def define(variant: Variant) -> SimpleNamespace:
         total = scalar(0.0)
         square = scalar(0.0)
         for i in range(nodes):
-            d = at(direction, i)
-            total += wp.dot(at(rhs, i), d)
+            d = load(direction, i)
+            total += wp.dot(load(rhs, i), d)
             gain = vec3()
             if is_free[i] != 0:
-                gain = at(solution, i) + d - at(base_velocity, i)
+                gain = load(solution, i) + d - load(base_velocity, i)
             along = scalar(0.0)
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    d_s = at(euler_direction, s)
-                    total += at(euler_rhs, s) * d_s
-                    gain_s = at(euler_solution, s) + d_s - at(base_euler_velocity, s)
+                    d_s = load(euler_direction, s)
+                    total += load(euler_rhs, s) * d_s
+                    gain_s = load(euler_solution, s) + d_s - load(base_euler_velocity, s)
                     along += scalar(0.5) * gain_s * gain_s
-            square += at(node_mass, i) * (wp.dot(gain, gain) + along)
-        control.slope[0] = total
+            square += load(node_mass, i) * (wp.dot(gain, gain) + along)
+        control.directional_derivative[0] = total
         control.kinetic[0] = square
         control.step_length[0] = scalar(1.0)
 
     @wp.kernel(module=module, enable_backward=False)
-    def decide(
+    def check_convergence(
         stage: int,
         residual: wp.array(dtype=scalar),
         control: NewtonControl,
@@ -201,7 +201,7 @@ def define(variant: Variant) -> SimpleNamespace:
         ‖δ‖ is in the norm of A, √(δ·A δ) = √(r·δ), which is more than that of M, and the change in that of M: kinetic
         energy. What it leaves is taken from the contraction.
         """
-        norm = wp.sqrt(wp.max(control.slope[0], scalar(0.0)))
+        norm = wp.sqrt(wp.max(control.directional_derivative[0], scalar(0.0)))
         left = scalar(CAUTION)
         if control.steps[0] > 0:
             control.contraction[0] = wp.max(norm / control.last_norm[0], scalar(TRUSTED))
@@ -223,13 +223,13 @@ def define(variant: Variant) -> SimpleNamespace:
         control.newton_iterations[0] = control.newton_iterations[0] + 1
         if status[0] == 0:
             residual[0] = norm / wp.max(control.change[0], scalar(1.0e-30))
-        control.finishes[0] = 0
+        control.take_unchecked_step[0] = 0
         small = left < scalar(1.0) and left * norm <= control.newton_tolerance[0] * control.change[0]
         if norm == scalar(0.0) or (control.step_length[0] == scalar(1.0) and small):
-            control.finishes[0] = 1
+            control.take_unchecked_step[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
-    def judge(
+    def control_newton(
         nodes: int,
         is_free: wp.array(dtype=int),
         inverse_x: wp.array(dtype=vec3),
@@ -253,67 +253,67 @@ def define(variant: Variant) -> SimpleNamespace:
         of_rhs = scalar(0.0)
         of_rounding = scalar(0.0)
         for i in range(nodes):
-            inverse = at(inverse_x, i)
-            r = at(rhs, i)
+            inverse = load(inverse_x, i)
+            r = load(rhs, i)
             if inverse[0] > scalar(0.0) and inverse[1] > scalar(0.0) and inverse[2] > scalar(0.0):
-                x = at(position, i)
+                x = load(position, i)
                 stiffness = (one / inverse[0] + one / inverse[1] + one / inverse[2]) * scalar(wp.static(1.0 / 3.0))
                 of_rhs += wp.dot(r, r) / stiffness
                 of_rounding += wp.dot(x, x) * stiffness
-                turned += wp.dot(r, at(direction, i))
+                turned += wp.dot(r, load(direction, i))
             elif is_free[i] != 0:
                 # a matrix without bounds: nothing here means anything
                 of_rhs += scalar(wp.static(float("inf")))
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    inverse_along = at(inverse_s, s)
+                    inverse_along = load(inverse_s, s)
                     if inverse_along > scalar(0.0):
-                        r_s = at(euler_rhs, s)
+                        r_s = load(euler_rhs, s)
                         of_rhs += inverse_along * r_s * r_s
-                        of_rounding += at(euler, s) * at(euler, s) / inverse_along
-                        turned += r_s * at(euler_direction, s)
+                        of_rounding += load(euler, s) * load(euler, s) / inverse_along
+                        turned += r_s * load(euler_direction, s)
         now = wp.sqrt(of_rhs)
         # velocities that positions are too coarse to tell from 0
         rounding = wp.sqrt(of_rounding) * scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
-        before = control.size[0]
-        first = control.tries[0] == 0
-        control.tries[0] = control.tries[0] + 1
-        control.continues[0] = 1
-        control.solves[0] = 1
-        control.refreshes[0] = 0
-        stalled = control.tries[0] > wp.static(MOST_TRIES)
+        before = control.residual_norm[0]
+        first = control.evaluations[0] == 0
+        control.evaluations[0] = control.evaluations[0] + 1
+        control.iterate[0] = 1
+        control.new_direction[0] = 1
+        control.rebuild_matrix[0] = 0
+        stalled = control.evaluations[0] > wp.static(MOST_TRIES)
         ordered = bool(True)
         if wp.static(sliding):
             ordered = control.shortest[0] > scalar(0.0)
             control.shortest[0] = scalar(wp.static(1.0e30))
-        if first or (ordered and (now < before or turned > scalar(-TURNED) * control.slope[0])):
+        if first or (ordered and (now < before or turned > scalar(-TURNED) * control.directional_derivative[0])):
             if not first and now > scalar(SLOW) * before:
                 # a step that hardly helps: the matrix is of another state
-                control.refreshes[0] = 1
+                control.rebuild_matrix[0] = 1
             if now == scalar(0.0) or (not first and now > scalar(0.5) * before and now <= rounding):
                 # what no longer falls, and is less than positions can tell, is rounding
-                control.continues[0] = 0
-            control.size[0] = now
+                control.iterate[0] = 0
+            control.residual_norm[0] = now
             before = now
         elif control.last_norm[0] <= control.newton_tolerance[0] * control.change[0]:
             # the step was small enough before it was taken: rounding
-            control.continues[0] = 0
+            control.iterate[0] = 0
         else:
-            control.solves[0] = 0
-            control.refreshes[0] = 1
+            control.new_direction[0] = 0
+            control.rebuild_matrix[0] = 1
             control.step_length[0] = control.step_length[0] * scalar(0.5)
             stalled = stalled or control.step_length[0] < scalar(wp.static(SHORTEST_STEP))
         if status[0] != 0:
-            control.continues[0] = 0
+            control.iterate[0] = 0
         elif not wp.isfinite(before):
-            control.continues[0] = 0
+            control.iterate[0] = 0
             status[0] = wp.static(NOT_FINITE)
             status[1] = -1
             for i in range(nodes):
                 if is_free[i] != 0 and not (wp.isfinite(rhs[i]) and wp.min(inverse_x[i]) > scalar(0.0)):
                     status[1] = i
-        elif stalled and control.continues[0] != 0:
-            control.continues[0] = 0
+        elif stalled and control.iterate[0] != 0:
+            control.iterate[0] = 0
             # what rounding leaves cannot be taken away; nor is there a need to where the last step was small enough
             small = not first and control.last_norm[0] <= control.newton_tolerance[0] * control.change[0]
             if not (small or before <= rounding * scalar(wp.static(ROUNDING))):
@@ -326,11 +326,11 @@ def define(variant: Variant) -> SimpleNamespace:
         euler: wp.array(dtype=scalar),
         shortest: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        sa, sb = coordinates(segments, index(wp.tid()))
         wp.atomic_min(shortest, 0, euler[sb] - euler[sa])
 
     @wp.kernel(module=module, enable_backward=False)
-    def keep_order(
+    def limit_step_length(
         segments: wp.array(dtype=wp.vec4i),
         stage_size: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
@@ -338,7 +338,7 @@ def define(variant: Variant) -> SimpleNamespace:
         step_length: wp.array(dtype=scalar),
     ):
         """Shortens the step along δ so far that it leaves something of every Δs."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        sa, sb = coordinates(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
         allowed = rest * scalar(wp.static(1.0 - NEAREST))
@@ -351,13 +351,13 @@ def define(variant: Variant) -> SimpleNamespace:
         step_size: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
         solution: wp.array(dtype=vec3),
-        refreshes: wp.array(dtype=int),
+        rebuild_matrix: wp.array(dtype=int),
     ):
         """Asks for a new matrix where a yarn turns in the step."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, _sa, _sb, _yarn, _direction = ends(segments, index(wp.tid()))
         moved = wp.length(solution[b] - solution[a]) * step_size[0]
         if moved > scalar(wp.static(TURNING)) * spacing[0]:
-            refreshes[0] = 1
+            rebuild_matrix[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def next_base(
@@ -402,20 +402,20 @@ def define(variant: Variant) -> SimpleNamespace:
         """Of the node that is farthest off: h · missing · |w₂ − what the first stage's acceleration led to|."""
         most = scalar(0.0)
         for i in range(nodes):
-            most = wp.max(most, wp.length_sq(at(solution, i) - at(predicted, i)))
+            most = wp.max(most, wp.length_sq(load(solution, i) - load(predicted, i)))
         step_error[0] = wp.sqrt(most) * missing[0] * step_size[0]
 
     return SimpleNamespace(
         enter_stage=enter_stage,
-        look_ahead=look_ahead,
-        correct=correct,
+        check_initial_guess=check_initial_guess,
+        apply_step=apply_step,
         lump_mass=lump_mass,
         start_rigid=start_rigid,
-        search=search,
-        decide=decide,
-        judge=judge,
+        begin_line_search=begin_line_search,
+        check_convergence=check_convergence,
+        control_newton=control_newton,
         shortest_segment=shortest_segment,
-        keep_order=keep_order,
+        limit_step_length=limit_step_length,
         ask_for_matrix=ask_for_matrix,
         next_base=next_base,
         estimate_error=estimate_error,

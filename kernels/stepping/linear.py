@@ -42,7 +42,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
                 euler_rhs[s] = f * step_size[0] + euler_momentum[s]
 
     @variant.kernel("terms")
-    def prescribe(
+    def set_pin_velocity(
         pin_node: wp.array(dtype=int),
         pin_target: wp.array(dtype=vec3),
         remaining: wp.array(dtype=scalar),
@@ -54,7 +54,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         i = index(pin_node[e])
         solution[i] = (pin_target[e] - position[i]) / remaining[0]
 
-    return SimpleNamespace(right_hand_side=right_hand_side, prescribe=prescribe)
+    return SimpleNamespace(right_hand_side=right_hand_side, set_pin_velocity=set_pin_velocity)
 
 
 @functools.cache
@@ -124,7 +124,7 @@ def define(variant: Variant) -> SimpleNamespace:
         status: wp.array(dtype=int),
     ):
         """Δs > 0: crossings keep their order along a yarn."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, _b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
         if euler[sb] <= euler[sa]:
             fail(status, wp.static(ORDER_LOST), a)
 

@@ -148,7 +148,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first_solution: wp.array(dtype=vec3),
         euler_first_solution: wp.array(dtype=scalar),
     ):
-        """w₁ and w₂ of a step that led from q to q⁺ and q̇⁺, which ``recall`` left in the solution.
+        """w₁ and w₂ of a step that led from q to q⁺ and q̇⁺, which ``restore_frame`` left in the solution.
 
         With a = (q⁺ − q)/h, w₁ + w₂ = 2γ (q̇⁺ − a)/(1 − γ) and w₁ = a − ½ (w₁ + w₂).
         """
@@ -183,8 +183,8 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity_grad: wp.array(dtype=scalar),
         stage_adjoint: wp.array(dtype=vec3),
         euler_stage_adjoint: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         rhs_grad: wp.array(dtype=vec3),
         euler_rhs_grad: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
@@ -196,7 +196,7 @@ def define(variant: Variant) -> SimpleNamespace:
         v = velocity_grad[i]
         w2 = position_grad[i] * half + v * rate
         finite = wp.isfinite(w2)
-        seed[i] = w2
+        adjoint_rhs[i] = w2
         stage_adjoint[i] = w2 + v
         velocity_grad[i] = vec3()
         rhs_grad[i] = vec3()
@@ -206,7 +206,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 v_s = euler_velocity_grad[s]
                 w2_s = euler_grad[s] * half + v_s * rate
                 finite = finite and wp.isfinite(w2_s)
-                euler_seed[s] = w2_s
+                euler_adjoint_rhs[s] = w2_s
                 euler_stage_adjoint[s] = w2_s + v_s
                 euler_velocity_grad[s] = scalar(0.0)
                 euler_rhs_grad[s] = scalar(0.0)
@@ -224,8 +224,8 @@ def define(variant: Variant) -> SimpleNamespace:
         solution_grad: wp.array(dtype=vec3),
         stage_adjoint: wp.array(dtype=vec3),
         euler_stage_adjoint: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
         """``enter_second_stage`` in reverse: the right-hand side w̄₁, with all of it, and v̄.
@@ -242,7 +242,7 @@ def define(variant: Variant) -> SimpleNamespace:
         if is_free[i] == 0:
             w1 -= solution_grad[i]
         finite = wp.isfinite(w1)
-        seed[i] = w1
+        adjoint_rhs[i] = w1
         adjoint.velocity_grad[i] = v2 * (one - rate) + m * two
         if wp.static(sliding):
             for d in range(2):
@@ -252,7 +252,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 w1_s = euler_stage_adjoint[s] + adjoint.euler_grad[s] * h + v2_s * rate - m_s * four
                 w1_s += euler_first_solution_grad[s]
                 finite = finite and wp.isfinite(w1_s)
-                euler_seed[s] = w1_s
+                euler_adjoint_rhs[s] = w1_s
                 adjoint.euler_velocity_grad[s] = v2_s * (one - rate) + m_s * two
         if not finite:
             fail(status, wp.static(NOT_FINITE), i)

@@ -93,7 +93,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
@@ -143,7 +143,7 @@ def define(variant: Variant) -> wp.Kernel:
         # forces out
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
-        press: int,
+        add_contact_load: int,
         contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
@@ -161,7 +161,7 @@ def define(variant: Variant) -> wp.Kernel:
         k = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / rest
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
-        if press != 0:
+        if add_contact_load != 0:
             # from the crimped positions, x − R n on a warp yarn and x + R n on a weft yarn
             half = scalar(0.5) - scalar(direction)
             crimp = scalar(-2.0) * half * radius[0]

@@ -88,7 +88,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar = variant.scalar
     BlockMatrix = structs(variant).BlockMatrix
     friction_force = functions(variant).force
 
@@ -144,7 +144,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
 
     @variant.kernel("terms")
-    def drag_anchor(
+    def update_anchor(
         crossing_node: wp.array(dtype=int),
         friction: wp.array(dtype=scalar),
         friction_stiffness: wp.array(dtype=scalar),
@@ -162,7 +162,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
             delta = euler_next[s] - anchor[s]
             anchor_next[s] = euler_next[s] - wp.clamp(delta, -reach, reach)
 
-    return drag_anchor
+    return update_anchor
 
 
 def define_energy(variant: Variant) -> wp.Kernel:

@@ -27,7 +27,7 @@ def define(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         half_density = scalar(0.5) * density[yarn]
         f = gravity[0] * (half_density * (euler[sb] - euler[sa]))
         wp.atomic_add(force, a, f)
@@ -52,7 +52,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         height = wp.dot(gravity[0], position[a] + position[b])
         wp.atomic_add(energy, 0, scalar(-0.5) * density[yarn] * rest * height)

@@ -19,7 +19,7 @@ from ..core.variant import Term, Variant
 
 
 def define_mass(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     BlockMatrix = structs(variant).BlockMatrix
 
     @variant.kernel("terms")
@@ -95,7 +95,7 @@ def define_inertia(variant: Variant) -> wp.Kernel:
         euler_force: wp.array(dtype=scalar),
     ):
         """∂T/∂q."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest
         va = velocity[a] - w * euler_velocity[sa]
@@ -128,7 +128,7 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
         euler_force: wp.array(dtype=scalar),
     ):
         """−Ṁ q̇: minus the rate of the momentum M q̇ when q moves and q̇ is held."""
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest
         va = velocity[a] - w * euler_velocity[sa]
@@ -165,7 +165,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler_velocity: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         va = velocity[a]
         vb = velocity[b]

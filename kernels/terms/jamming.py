@@ -55,7 +55,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar = variant.scalar
     BlockMatrix = structs(variant).BlockMatrix
     barrier = functions(variant).barrier
     stretch_stiffness = stretching.functions(variant).stiffness
@@ -116,7 +116,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         distance = scalar(2.0) * radius[0]
         if flipped[a] != flipped[b]:
             distance = scalar(4.0) * radius[0]

@@ -14,7 +14,7 @@ from ..core.variant import Term, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3 = variant.scalar, variant.vec3
     BlockMatrix = structs(variant).BlockMatrix
 
     @variant.kernel("terms")
@@ -31,7 +31,9 @@ def define(variant: Variant) -> wp.Kernel:
         i = index(pin_node[e])
         wp.atomic_add(force, i, (pin_target[e] - position[i]) * pin_stiffness[0])
         if matrix != 0:
-            wp.atomic_add(blocks.diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (blocks.coefficients[0][2] * pin_stiffness[0]))
+            wp.atomic_add(
+                blocks.diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (blocks.coefficients[0][2] * pin_stiffness[0])
+            )
 
     return pin_term
 

@@ -115,7 +115,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3 = variant.scalar, variant.vec3
     BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked

@@ -38,7 +38,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     BlockMatrix = structs(variant).BlockMatrix
     stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
 
@@ -56,7 +56,7 @@ def define(variant: Variant) -> wp.Kernel:
         # forces out
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
-        press: int,
+        add_contact_load: int,
         contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
@@ -70,7 +70,7 @@ def define(variant: Variant) -> wp.Kernel:
         f = stretch_force(d, rest, k)
         wp.atomic_add(force, a, f)
         wp.atomic_add(force, b, -f)
-        if press != 0:
+        if add_contact_load != 0:
             # added for the warp, subtracted for the weft
             half = scalar(0.5) - scalar(direction)
             wp.atomic_add(contact_load, a, half * wp.dot(normal[a], f))
@@ -116,7 +116,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         strain = wp.length(position[b] - position[a]) / rest - scalar(1.0)
         k = stretch_stiffness(stretch[yarn], radius[0])

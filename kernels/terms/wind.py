@@ -18,7 +18,7 @@ from ..core.variant import Term, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3 = variant.scalar, variant.vec3
     BlockMatrix = structs(variant).BlockMatrix
 
     @variant.kernel("terms")

@@ -69,7 +69,7 @@ EXACT = 1e-8
 """Both tolerances of differentiable runs in double precision: gradients are right to no more digits than these."""
 
 
-class Graphs(dict[str, Any]):
+class GraphCache(dict[str, Any]):
     """Launches by name, captured at their first call and replayed from then on: twenty of them cost microseconds."""
 
     def __init__(self, device: Any):
@@ -94,7 +94,7 @@ class Model:
         arrays: by the names that kernels use.
         kernels: by name.
         strips: of the cloth, one a processor core that a linear solve takes.
-        held: whether pins are exact.
+        has_hard_pins: whether pins are exact.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Model:
             raise InputError(f"device = {device!r}, must be one of {names}") from error
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
-        self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
+        self.has_hard_pins = len(scene.pins) > 0 and scene.pin_stiffness is None
         self.arrays = Arrays(scene, variant, self.device)
         self.set_times(self.step_size, self.step_size, self.step_size)
         self._add_ledger()
@@ -211,7 +211,7 @@ class Model:
         a = self.arrays
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
-        reached = [1.0 if self.held else begun + time * step / self.step_size for time in (*times, 1.0)]
+        reached = [1.0 if self.has_hard_pins else begun + time * step / self.step_size for time in (*times, 1.0)]
         a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)), begun)
         a.put("step_size", step)
         a.put("remaining", remaining)
@@ -258,7 +258,7 @@ class Model:
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
-            self.launch(term.name, term.elements, matrix=filled, press=int(a.contact), **arrays)
+            self.launch(term.name, term.elements, matrix=filled, add_contact_load=int(a.contact), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def _find_normals(self) -> None:
@@ -267,7 +267,7 @@ class Model:
             self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
 
-    def press(self) -> None:
+    def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
         a = self.arrays
         self._find_normals()
@@ -275,12 +275,12 @@ class Model:
             if a.contact and term.presses:
                 # the forces go where the solver works
                 unused = {"force": a["q_x"], "euler_force": a["q_s"]}
-                self.launch(term.name, term.elements, matrix=0, press=1, **unused)
+                self.launch(term.name, term.elements, matrix=0, add_contact_load=1, **unused)
 
-    def prescribe(self, **replaced: Any) -> None:
+    def set_pin_velocity(self, **replaced: Any) -> None:
         """Gives exact pins the velocity that brings them to their place."""
-        if self.held:
-            self.launch("prescribe", "pins", **replaced)
+        if self.has_hard_pins:
+            self.launch("set_pin_velocity", "pins", **replaced)
 
     def factorize(self) -> None:
         """The preconditioner of the assembled matrix."""
@@ -343,11 +343,11 @@ class Model:
                 helper.join()
             self._team_of(1)
 
-    def drag_anchor(self, euler: str, anchor: str) -> None:
+    def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
         a = self.arrays
         if a["anchor"] is not None:
-            self.launch("drag_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
+            self.launch("update_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
 
     def end_step(self, *, by_stages: bool = False) -> None:
         """What every method ends a step with, its end state in place: checks and moves on, and records the frame.
@@ -359,39 +359,39 @@ class Model:
             self.launch("check_order", "segments")
         if "pin_motion" in self.arrays:
             # pins are looked at where they are now, not where they were at the last stage's time
-            self.take_inputs(AT_END)
+            self.load_inputs(AT_END)
         if self.watches:
             self._close_step(by_stages)
-        self.drag_anchor("euler", "anchor")
+        self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
 
     def add_adjoint_arrays(self) -> None:
         """Room for the right-hand side of the adjoint solve, and for (u, v) and the anchors at the end of a step."""
         a, n = self.arrays, self.arrays["nodes"]
-        a["seed"] = a.zeros(n, a.variant.vec3)
-        for name in ("euler_seed", "euler_next"):
+        a["adjoint_rhs"] = a.zeros(n, a.variant.vec3)
+        for name in ("euler_adjoint_rhs", "euler_next"):
             a[name] = a.zeros(2 * n, a.variant.scalar) if self.scene.sliding else None
         a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, a.variant.scalar)
 
-    def take_inputs(self, stage: int = 0) -> None:
+    def load_inputs(self, stage: int = 0) -> None:
         """Puts pins and applied forces of a stage of this step in place, where they change."""
         a = self.arrays
         if "applied_force_path" in a:
             path, values = a["applied_force_path"], a["applied_force"]
-            self.launch("take", len(values), path=path, values=values)
+            self.launch("load_inputs", len(values), path=path, values=values)
         if "pin_target_path" in a:
             arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
             self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
 
-    def give_inputs(self, name: str, stage: int) -> None:
-        """Adjoint of ``take_inputs`` for one of ``PATHS``."""
+    def scatter_input_gradient(self, name: str, stage: int) -> None:
+        """Adjoint of ``load_inputs`` for one of ``PATHS``."""
         a = self.arrays
         gradients = {"values_grad": a[name].grad, "path_grad": a[f"{name}_path"].grad}
         if name == "applied_force":
-            self.launch("give", len(a[name]), **gradients)
+            self.launch("scatter_gradient", len(a[name]), **gradients)
         else:
-            self.launch("give_back_along", "pins", stage=stage, **gradients)
+            self.launch("scatter_gradient_along", "pins", stage=stage, **gradients)
 
     # -- energy ------------------------------------------------------------------------------------------------------
 
@@ -399,7 +399,7 @@ class Model:
         """Room for the watch over energy (``kernels/stepping/energy_watch.py``)."""
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
-        self.watches = not (self.held and self.scene.pin_path is not None)
+        self.watches = not (self.has_hard_pins and self.scene.pin_path is not None)
         counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 7}
         for name, count in counts.items():
             a[name] = a.zeros(count, a.variant.scalar)
@@ -435,8 +435,8 @@ class Model:
 
     def _audit(self) -> None:
         if "pin_motion" in self.arrays:
-            self.take_inputs(AT_START)
-        self.press()
+            self.load_inputs(AT_START)
+        self.add_contact_load()
         self.arrays.zero("energy", "elastic_energy", "height_energy")
         self._add_energies(cheap=True)
         self._add_energies(cheap=False)
@@ -471,7 +471,7 @@ class Model:
         a = self.arrays
         a.zero(target)
         for term in self._outer:
-            self.launch(term.name, term.elements, matrix=0, press=0, force=a[target])
+            self.launch(term.name, term.elements, matrix=0, add_contact_load=0, force=a[target])
 
     def _add_powers(self) -> None:
         """The power of outer forces and of moving pins at the present state."""

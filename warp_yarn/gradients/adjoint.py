@@ -8,7 +8,6 @@ same matrix (it is symmetric), and runs the assembling kernels in reverse (the i
 from __future__ import annotations
 
 import numpy as np
-import warp as wp
 
 from ..device.arrays import STATE_TYPES, arrays_of
 from ..device.model import PATHS
@@ -39,17 +38,17 @@ class Adjoint:
             if f"loss_{name}" not in a:
                 array, frames = a[name], simulator.chunk + 1
                 a[f"loss_{name}"] = None if array is None else a.zeros(frames * array.shape[0], array.dtype)
-        simulator.integrator.prepare_adjoint(self._receive, self._give)
+        simulator.integrator.prepare_adjoint(self._add_loss_gradient, self._scatter_gradient)
 
-    def _receive(self) -> None:
+    def _add_loss_gradient(self) -> None:
         """Takes in what the loss asks of the present frame."""
         frames = {f"frame_{name}_grad": self.arrays[f"loss_{name}"] for name in STATE_TYPES}
-        self.simulator.model.launch("receive", "nodes", **frames)
+        self.simulator.model.launch("add_loss_gradient", "nodes", **frames)
 
-    def _give(self, stage: int) -> None:
+    def _scatter_gradient(self, stage: int) -> None:
         """Hands what a stage gave to inputs that change from step to step to the rows of their paths."""
         for name in self.moving:
-            self.simulator.model.give_inputs(name, stage)
+            self.simulator.model.scatter_input_gradient(name, stage)
 
     def release(self) -> None:
         """Gives the gradients of parameters up, before another one asks for other parameters."""
@@ -76,14 +75,14 @@ class Adjoint:
         a.put("counters", steps, before + first + steps)
         with self.simulator.model.team():
             for k in range(steps, 0, -1):
-                self.simulator.integrator.retreat()
+                self.simulator.integrator.backward_step()
                 if a["status"].numpy()[0]:
                     self._fail(first + k)
 
     def finish(self) -> None:
         """Takes in what the loss asks of the first frame; the running adjoints are then those of the initial state."""
         self.arrays.zero("counters")
-        self._receive()
+        self._add_loss_gradient()
         for name in self.wanted:
             array = self.arrays[name]
             if array is not None and not np.isfinite(array.grad.numpy()).all():

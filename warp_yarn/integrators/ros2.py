@@ -62,16 +62,16 @@ class ROS2(LinearlyImplicitEuler):
         model, a = self.model, self.model.arrays
         first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
         model.open_step()
-        model.take_inputs()
+        model.load_inputs()
         self._assemble_first()
         model.copy(first_solution="velocity", euler_first_solution="euler_velocity")
-        model.prescribe(solution=a["first_solution"])
+        model.set_pin_velocity(solution=a["first_solution"])
         model.factorize()
         model.solve(**first)
         model.launch("enter_second_stage", "nodes", start=a["solution"], euler_start=a["euler_solution"])
         if model.scene.sliding:
             model.launch("check_order", "segments")
-        model.take_inputs(1)
+        model.load_inputs(1)
         self._assemble_second()
         model.factorize()
         model.solve()
@@ -104,12 +104,12 @@ class ROS2(LinearlyImplicitEuler):
 
     def _record(self) -> None:
         self._assemble_first()
-        self.model.prescribe()
+        self.model.set_pin_velocity()
 
     def _reverse(self) -> None:
         model, a = self.model, self.model.arrays
-        self._recall()
-        model.take_inputs(1)
+        self._restore()
+        model.load_inputs(1)
         model.launch("recall_both_stages", "nodes")
         model.launch("enter_second_stage", "nodes", start=None, euler_start=None)
         self._assemble_second()
@@ -121,8 +121,8 @@ class ROS2(LinearlyImplicitEuler):
         _, after = self._around
         after(1)
 
-        model.launch("recall", "nodes")
-        model.take_inputs()
+        model.launch("restore_frame", "nodes")
+        model.load_inputs()
         self._assemble_first()
         a.zero_grad(*BETWEEN)
         model.launch("first_stage_adjoint", "nodes")

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..device.arrays import arrays_of
-from ..device.model import BETWEEN, Graphs, Model
+from ..device.model import BETWEEN, GraphCache, Model
 from ..kernels.core.status import STALLED
 
 STATE = ("position", "euler", "velocity", "euler_velocity")
@@ -32,8 +32,9 @@ class StageMethod:
     the stage itself ends the step, and so does a second stage.
 
     Newton's iteration ends with the step that leaves less than newton_tolerance of the change of velocity, by what the
-    steps before it left: looking at where it led would only confirm it (``decide`` in ``kernels/nonlinear/newton.py``,
-    ``docs/solver.md``). Along δ it takes a full step unless that overshoots: r·δ is minus the slope of the energy that
+    steps before it left: looking at where it led would only confirm it (``check_convergence`` in
+    ``kernels/nonlinear/newton.py``, ``docs/solver.md``).
+    Along δ it takes a full step unless that overshoots: r·δ is minus the slope of the energy that
     a stage minimizes, where there is one, and must not turn to more than 0.9 of itself with the other sign, or else ‖r‖
     must fall. (That it always falls is too much to ask of yarns that buckle.) Nor may crossings change their order.
     """
@@ -56,10 +57,19 @@ class StageMethod:
         vectors = ("base_position", "base_velocity", "increment", "direction", "solution_before")
         rates = ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before")
         numbers = (
-            "size", "slope", "contraction", "kinetic", "last_norm", "change", "first_change",
+            "residual_norm", "directional_derivative", "contraction", "kinetic", "last_norm", "change", "first_change",
             "stage_size", "carried_time", "carried_rate", "newton_tolerance",
         )  # fmt: skip
-        counts = ("tries", "steps", "continues", "finishes", "solves", "refreshes", "crosses", "newton_iterations")
+        counts = (
+            "evaluations",
+            "steps",
+            "iterate",
+            "take_unchecked_step",
+            "new_direction",
+            "rebuild_matrix",
+            "order_would_be_lost",
+            "newton_iterations",
+        )
         for names, count, dtype in (
             (vectors, n, vec3),
             (rates, 2 * n if sliding else 0, scalar),
@@ -80,7 +90,7 @@ class StageMethod:
         ):
             a.setdefault(name, a.numbers(value))
         self.set_times(model.step_size, model.step_size)
-        self._graphs = Graphs(model.device)
+        self._graphs = GraphCache(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
         """As of Model.set_times."""
@@ -109,7 +119,7 @@ class StageMethod:
         self._begin()
         for stage in range(self.stages):
             if stage:
-                model.take_inputs(stage)
+                model.load_inputs(stage)
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
                 if estimates:
@@ -157,11 +167,11 @@ class StageMethod:
         model = self.model
         model.open_step()
         model.begin_work()
-        model.take_inputs()
+        model.load_inputs()
         model.arrays.zero("newton_iterations", "node_mass")
         model.launch("lump_mass", "segments")
         model.copy(solution="velocity", euler_solution="euler_velocity")
-        model.prescribe()
+        model.set_pin_velocity()
         self._set_base()
 
     def _set_base(self) -> None:
@@ -189,45 +199,45 @@ class StageMethod:
         from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
         turn."""
         a = self.model.arrays
-        a.zero("tries", "steps", "direction", "euler_direction")
+        a.zero("evaluations", "steps", "direction", "euler_direction")
         if self.model.scene.sliding:
-            a.zero("crosses")
-            self.model.launch("look_ahead", "segments")
-            wp.capture_if(a["crosses"], on_true=lambda: a.zero("euler_solution"))
+            a.zero("order_would_be_lost")
+            self.model.launch("check_initial_guess", "segments")
+            wp.capture_if(a["order_would_be_lost"], on_true=lambda: a.zero("euler_solution"))
         if stage == 0:
             self._evaluate(matrix=True)
         else:
             self._evaluate_as_asked()
-        self._judge()
-        wp.capture_while(a["continues"], lambda: self._iterate(stage))
+        self._control()
+        wp.capture_while(a["iterate"], lambda: self._iterate(stage))
 
     def _evaluate_as_asked(self) -> None:
         wp.capture_if(
-            self.model.arrays["refreshes"],
+            self.model.arrays["rebuild_matrix"],
             on_true=lambda: self._evaluate(matrix=True),
             on_false=lambda: self._evaluate(matrix=False),
         )
 
-    def _judge(self) -> None:
+    def _control(self) -> None:
         if self.model.scene.sliding:
             self.model.launch("shortest_segment", "segments")
-        self.model.launch("judge", 1)
+        self.model.launch("control_newton", 1)
 
     def _iterate(self, stage: int) -> None:
         a = self.model.arrays
-        a.zero("finishes")
-        wp.capture_if(a["solves"], on_true=lambda: self._solve_direction(stage))
-        self.model.launch("correct", "nodes")
-        wp.capture_if(a["finishes"], on_true=self._finish_stage, on_false=self._look)
+        a.zero("take_unchecked_step")
+        wp.capture_if(a["new_direction"], on_true=lambda: self._solve_direction(stage))
+        self.model.launch("apply_step", "nodes")
+        wp.capture_if(a["take_unchecked_step"], on_true=self._finish_stage, on_false=self._check)
 
     def _finish_stage(self) -> None:
         """Ends with the last step, without a look at where it led."""
         self.model.launch("enter_stage", "nodes")
-        self.model.arrays.zero("continues")
+        self.model.arrays.zero("iterate")
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         self._evaluate_as_asked()
-        self._judge()
+        self._control()
 
     def _solve_direction(self, stage: int) -> None:
         """δ, from A δ = r."""
@@ -237,10 +247,10 @@ class StageMethod:
             self.model.launch("start_rigid", 1)
         self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
         self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
-        self.model.launch("search", 1)
+        self.model.launch("begin_line_search", 1)
         if self.model.scene.sliding:
-            self.model.launch("keep_order", "segments")
-        self.model.launch("decide", 1, stage=stage)
+            self.model.launch("limit_step_length", "segments")
+        self.model.launch("check_convergence", 1, stage=stage)
 
     @property
     def _rounding(self) -> float:
@@ -261,32 +271,32 @@ class StageMethod:
         """As of LinearlyImplicitEuler."""
         model, a = self.model, self.model.arrays
         vec3, scalar, n, sliding = a.variant.vec3, a.variant.scalar, a["nodes"], model.scene.sliding
-        if "seed" not in a:
+        if "adjoint_rhs" not in a:
             model.add_adjoint_arrays()
             for name in ("stage_adjoint", "zero", "first_solution"):
                 a[name] = a.zeros(n, vec3)
                 a[f"euler_{name}"] = a.zeros(2 * n, scalar) if sliding else None
-            a["first_size"] = a.zeros(1, scalar)
+            a["first_residual_norm"] = a.zeros(1, scalar)
             a["adjoint_tolerance"] = a.numbers(self._adjoint_tolerance)
         base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
         a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if sliding:
             a["euler_next"].grad = a["base_euler"].grad
-        self.tape, self.anchor_tape, self.held_tape = wp.Tape(), wp.Tape(), wp.Tape()
+        self.tape, self.anchor_tape, self.pin_tape = wp.Tape(), wp.Tape(), wp.Tape()
         with self.tape:
             self._assemble(matrix=False)
         with self.anchor_tape:
-            model.drag_anchor("euler_next", "anchor_next")
-        with self.held_tape:
-            model.prescribe(position=a["base_position"])
+            model.update_anchor("euler_next", "anchor_next")
+        with self.pin_tape:
+            model.set_pin_velocity(position=a["base_position"])
         self._around = before, after
         self._added = self._arrays_added_to()
         for name in self._graphs.keys() - {"_step"}:
             del self._graphs[name]
 
-    def retreat(self) -> None:
+    def backward_step(self) -> None:
         """As of LinearlyImplicitEuler; (−∂r/∂w)ᵀ λ = w̄ is solved to the linear tolerance, with the exact derivative."""
-        self._run(self._recall)
+        self._run(self._restore)
         self._run(self._enter_last)
         self._solve_adjoint()
         if self.stages == 2:
@@ -294,14 +304,14 @@ class StageMethod:
             self._solve_adjoint()
         self._run(self._finish)
 
-    def _recall(self) -> None:
+    def _restore(self) -> None:
         """The step that ends at the present frame; the running adjoints go to the base."""
         model, a = self.model, self.model.arrays
         before, _ = self._around
         before()
         model.launch("count", 1, by=-1)
-        model.launch("recall", "nodes")
-        model.take_inputs(self.stages - 1)
+        model.launch("restore_frame", "nodes")
+        model.load_inputs(self.stages - 1)
         self._set_base()
         if self._is_carried:
             model.launch("recall_carried_stage", "nodes")
@@ -331,8 +341,8 @@ class StageMethod:
         model, a = self.model, self.model.arrays
         _, after = self._around
         after(1)
-        model.take_inputs()
-        model.launch("recall", "nodes")
+        model.load_inputs()
+        model.launch("restore_frame", "nodes")
         self._set_base()
         self.model.copy(solution="first_solution", euler_solution="euler_first_solution")
         self._enter()
@@ -348,10 +358,10 @@ class StageMethod:
         """λ of (−∂r/∂w)ᵀ λ = ρ₀: reverse mode with all of it, and its share of the adjoints of q₀ and v₀."""
         a = self.model.arrays
         self._run(self._descend)
-        size, first = (float(a[name].numpy()[0]) for name in ("size", "first_size"))
+        size, first = (float(a[name].numpy()[0]) for name in ("residual_norm", "first_residual_norm"))
         if not size <= self._adjoint_tolerance * first and not a["status"].numpy()[0]:
             self._minimize(size, first)
-        self._run(self._absorb)
+        self._run(self._add_stage_adjoint)
 
     def _descend(self) -> None:
         """Parts of λ, each A⁻¹ ρ of what the parts before it left, as long as they more than halve ρ.
@@ -359,16 +369,16 @@ class StageMethod:
         Reverse mode adds to what it has added for the parts before: in the end it has run for all of λ.
         """
         a = self.model.arrays
-        a.zero("tries")
+        a.zero("evaluations")
         self._gather()
-        self.model.launch("judge_adjoint", 1)
-        wp.capture_while(a["continues"], self._descend_once)
+        self.model.launch("control_adjoint", 1)
+        wp.capture_while(a["iterate"], self._descend_once)
 
     def _descend_once(self) -> None:
         self._solve_part()
         self._reverse()
         self._gather()
-        self.model.launch("judge_adjoint", 1)
+        self.model.launch("control_adjoint", 1)
 
     def _minimize(self, left: float, first: float) -> None:
         """What is left of λ, from a ρ of this size, by GMRES with the preconditioner A; ``first`` was that of ρ₀.
@@ -376,7 +386,7 @@ class StageMethod:
         Where yarns slide fast, A alone need not contract.
         """
         a = self.model.arrays
-        rho = self._vector("seed")
+        rho = self._vector("adjoint_rhs")
         # Products with the derivative run all of reverse mode: what it adds to is put back, and added to at the end.
         kept = {name: a[name].grad.numpy().copy() for name in self._added}
         weight = np.sqrt(self._vector("inverse_x", "inverse_s"))
@@ -388,11 +398,11 @@ class StageMethod:
                 return
             if not basis:
                 basis.append(weight * rho / left)
-            self._set_vector("seed", basis[-1] / np.where(weight > 0.0, weight, 1.0))
+            self._set_vector("adjoint_rhs", basis[-1] / np.where(weight > 0.0, weight, 1.0))
             self._run(self._solve_part)
             parts.append(self._vector("rhs", gradient=True))
             self._run(self._product)
-            image = -weight * self._vector("seed")
+            image = -weight * self._vector("adjoint_rhs")
             # modified Gram-Schmidt, twice: once loses what GMRES needs of orthogonality near the end
             column = np.zeros(len(basis))
             for _ in range(2):
@@ -458,7 +468,7 @@ class StageMethod:
         a = self.model.arrays
         a.zero_grad("rhs", "euler_rhs")
         part = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
-        self.model.solve(tolerance=a["inner_tolerance"], rhs=a["seed"], euler_rhs=a["euler_seed"], **part)
+        self.model.solve(tolerance=a["inner_tolerance"], rhs=a["adjoint_rhs"], euler_rhs=a["euler_adjoint_rhs"], **part)
 
     def _product(self) -> None:
         """(∂r/∂w)ᵀ of the part in the gradient of the right-hand side."""
@@ -472,17 +482,17 @@ class StageMethod:
         self.model.arrays.zero_grad(*BETWEEN)
         self.tape.backward()
 
-    def _absorb(self) -> None:
+    def _add_stage_adjoint(self) -> None:
         model, a = self.model, self.model.arrays
-        if model.held:
+        if model.has_hard_pins:
             # what is held has no λ: its row of ρ is the adjoint of the velocity that holds it
             a.zero("q_x")
-            model.launch("held_adjoint", "pins")
+            model.launch("hard_pin_adjoint", "pins")
         model.launch("absorb_stage", "nodes")
 
     def _finish(self) -> None:
-        if self.model.held:
-            self.held_tape.backward()
+        if self.model.has_hard_pins:
+            self.pin_tape.backward()
         self.model.copy(**{f"{name}_grad": f"base_{name}_grad" for name in STATE})
         _, after = self._around
         after(0)

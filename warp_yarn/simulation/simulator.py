@@ -19,7 +19,7 @@ import warp as wp
 from ..description.scene import Scene
 from ..device.arrays import STATE_TYPES, YARN_PARAMETERS
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
-from ..device.model import Graphs, Model
+from ..device.model import GraphCache, Model
 from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels.core import status
@@ -192,7 +192,7 @@ class Simulator:
             self.parts = Parts(self.model, self.integrator, allowed, fallback)
             self.chunk = _checked_chunk(chunk, scene.cloth.nodes)
             self.arrays.add_frames(self.chunk + 1)
-            self._graphs = Graphs(self.model.device)
+            self._graphs = GraphCache(self.model.device)
             self._steps_done = 0
             self.split_steps: dict[int, float] = {}
             self.damped_steps: set[int] = set()
@@ -593,7 +593,7 @@ class Simulator:
         a, nodes, result = self.arrays, self.scene.cloth.nodes, {}
         crossing = np.repeat(self.scene.cloth.topology.is_crossing != 0, 2)
         with _Visit(self, state):
-            self.model.press()
+            self.model.add_contact_load()
             total = np.zeros(2 * nodes)
             for term in a.terms:
                 if term.name == "mass":
@@ -601,7 +601,7 @@ class Simulator:
                 a.zero("force", "euler_force", "friction_force_out")
                 if term.name == "friction":
                     a["euler_force"].assign(total)
-                self.model.launch(term.name, term.elements, matrix=0, press=0)
+                self.model.launch(term.name, term.elements, matrix=0, add_contact_load=0)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"
                 along = np.zeros(2 * nodes)
                 if a[out] is not None:
@@ -617,7 +617,7 @@ class Simulator:
         if not self.arrays.contact:
             raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
         with _Visit(self, state):
-            self.model.press()
+            self.model.add_contact_load()
             load = self.arrays["contact_load"].numpy().astype(np.float64)
             return self.arrays["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
 
@@ -626,7 +626,7 @@ class Simulator:
         """Energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.arrays, {}
         with _Visit(self, state):
-            self.model.press()
+            self.model.add_contact_load()
             energy = a.zeros(1, a.variant.scalar)
             for term in a.terms:
                 if term.energy is not None:
@@ -677,7 +677,7 @@ class _Visit:
         simulator.arrays.put("counters", 0, self.row)
         # before the first step, pins are where they start
         simulator.arrays.put("stage_times", *[float(self.ahead or simulator._steps_done > 0)] * 4)
-        simulator.model.take_inputs()
+        simulator.model.load_inputs()
         if self.visited is not None:
             simulator._upload(self.visited)
 

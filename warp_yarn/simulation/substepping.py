@@ -11,7 +11,7 @@ from typing import Any
 
 from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE
-from ..device.model import Graphs, Model
+from ..device.model import GraphCache, Model
 from ..kernels.core.status import GAINED, INACCURATE
 
 SMALLEST = 2.0**-7
@@ -46,7 +46,7 @@ class Parts:
         self._make_fallback: Any = fallback
         self._fallback: Any = None
         self.reset()
-        self._graphs = Graphs(model.device)
+        self._graphs = GraphCache(model.device)
 
     def reset(self) -> None:
         """Begins anew, as for another motion."""
