@@ -325,10 +325,10 @@ def test_step_control_from_the_command(monkeypatch, tmp_path):
 def test_array_bytes_counts_each_memory_once():
     simulator = wy.Simulator(wy.paper.hung_cloth(rows=5, columns=5))
     counted = sizes.array_bytes(simulator)
-    simulator.arrays["again"] = simulator.arrays["position"]
+    simulator.arrays["predicted"] = simulator.arrays["position"]
     assert sizes.array_bytes(simulator) == counted
-    simulator.arrays["more"] = simulator.arrays.zeros(7, wp.vec3d)
-    assert sizes.array_bytes(simulator) == counted + 7 * 24
+    simulator.arrays["predicted"] = simulator.arrays.new("predicted")
+    assert sizes.array_bytes(simulator) == counted + 25 * 24
 
 
 @pytest.mark.slow

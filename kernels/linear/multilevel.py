@@ -147,25 +147,25 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def factorize_lines(
-        direction: int,
+        along: int,
         blocks: BlockMatrix,
         is_free: wp.array(dtype=int),
         is_crossing: wp.array(dtype=int),
         levels: Levels,
     ):
         """Every line of the cloth along one direction; warp yarns come first."""
-        k = wp.tid() + direction * levels.warp_lines
+        k = wp.tid() + along * levels.warp_lines
         factorize_nodes(
-            direction, load(levels.line_start, k), load(levels.line_start, k + 1), levels.line_node,
+            along, load(levels.line_start, k), load(levels.line_start, k + 1), levels.line_node,
             blocks, is_free, is_crossing, levels.line_factor, levels.halves,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
-    def factorize_coarse_lines(direction: int, levels: Levels):
+    def factorize_coarse_lines(along: int, levels: Levels):
         """Every line of the coarse levels along one direction."""
-        k = wp.tid() + direction * levels.coarse_warp_lines
+        k = wp.tid() + along * levels.coarse_warp_lines
         factorize_coarse(
-            direction, load(levels.coarse_line_start, k), load(levels.coarse_line_start, k + 1),
+            along, load(levels.coarse_line_start, k), load(levels.coarse_line_start, k + 1),
             levels.coarse_line_node, levels.blocks_per_node,
             levels.coarse_block, levels.coarse_line_factor, levels.coarse_halves,
         )  # fmt: skip

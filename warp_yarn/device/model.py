@@ -21,7 +21,7 @@ from ..description.scene import Scene
 from ..errors import InputError, choice, number, whole
 from ..kernels import Term, Variant, build
 from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
-from . import exclusive
+from . import declarations, exclusive
 from .arrays import Arrays
 
 MATRIX = (
@@ -138,11 +138,10 @@ class Model:
             raise InputError(f"device = {device!r}, must be one of {names}") from error
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
-        self.has_hard_pins = len(scene.pins) > 0 and scene.pin_stiffness is None
         self.arrays = Arrays(scene, variant, self.device)
+        self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
         self._add_ledger()
-        self.arrays["tolerance"] = self.arrays.numbers(self.tolerance)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
         self._form_team(whole("threads", threads, least=1))
@@ -186,13 +185,12 @@ class Model:
             )
         columns = self.scene.cloth.weave.columns
         self.strips = max(1, min(threads, columns // NARROWEST_STRIP))
-        a["columns"] = columns
-        a["sums"] = a.zeros(5 * self.strips, a.variant.scalar)
-        a["team"] = a.zeros(16 + 16 * self.strips, wp.int32)
+        a.sizes |= {"thread": self.strips, "signal": 16 + 16 * self.strips}
+        a.make(declarations.LINEAR_WORKSPACE)
+        a.put("tolerance", self.tolerance)
         self._team_of(1)
         if self.strips > 1:
-            for name in SOLVED:
-                a[f"team_{name}"] = None if a[name] is None else a.zeros(a[name].shape[0], a[name].dtype)
+            a.make(declarations.THREADS_WORKSPACE)
 
     def _team_of(self, strips: int) -> None:
         """Begins to count anew, for so many strips."""
@@ -220,6 +218,10 @@ class Model:
     def launch(self, kernel: str, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel by its name (see ``Arrays.launch``)."""
         self.arrays.launch(self.kernels[kernel], elements, **replaced)
+
+    def launch_term(self, term: Term, **offered: Any) -> None:
+        """Launch a term, with what its kernel has arguments for."""
+        self.launch(term.name, term.elements, **self.arrays.taken(self.kernels[term.name], **offered))
 
     def copy(self, **targets: str) -> None:
         """Copies arrays, target="source", those that the scene has; ``x_grad`` is the gradient of ``x``."""
@@ -258,7 +260,7 @@ class Model:
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
-            self.launch(term.name, term.elements, matrix=filled, add_contact_load=int(a.contact), **arrays)
+            self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def _find_normals(self) -> None:
@@ -275,7 +277,7 @@ class Model:
             if a.contact and term.presses:
                 # the forces go where the solver works
                 unused = {"force": a["q_x"], "euler_force": a["q_s"]}
-                self.launch(term.name, term.elements, matrix=0, add_contact_load=1, **unused)
+                self.launch_term(term, matrix=0, add_contact_load=1, **unused)
 
     def set_pin_velocity(self, **replaced: Any) -> None:
         """Gives exact pins the velocity that brings them to their place."""
@@ -295,8 +297,8 @@ class Model:
         for first, end in itertools.pairwise(starts):
             self.launch("coarsen", BLOCKS * (end - first), first=first)
         for direction, name in enumerate(("warp_lines", "weft_lines")):
-            self.launch("factorize_lines", name, direction=direction)
-            self.launch("factorize_coarse_lines", f"coarse_{name}", direction=direction)
+            self.launch("factorize_lines", name, along=direction)
+            self.launch("factorize_coarse_lines", f"coarse_{name}", along=direction)
         if len(starts) > 1:
             first, end = starts[-2:]
             self.launch("factorize_coarsest", 1, first=first, count=end - first)
@@ -307,7 +309,8 @@ class Model:
         arrays = {name: replaced.get(name, a[name]) for name in SOLVED}
         kernel = f"{self.preconditioner}_conjugate_gradient"
         if self.strips == 1:
-            self.launch(kernel, 1, strip=0, most_iterations=self.max_iterations, **arrays)
+            alone = {} if self.preconditioner == "jacobi" else {"strip": 0}
+            self.launch(kernel, 1, most_iterations=self.max_iterations, **alone, **arrays)
             return
         # helpers were launched with arrays of their own
         for name, array in arrays.items():
@@ -357,7 +360,7 @@ class Model:
         """
         if self.scene.sliding:
             self.launch("check_order", "segments")
-        if "pin_motion" in self.arrays:
+        if "pins move" in self.arrays.conditions:
             # pins are looked at where they are now, not where they were at the last stage's time
             self.load_inputs(AT_END)
         if self.watches:
@@ -366,21 +369,13 @@ class Model:
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
 
-    def add_adjoint_arrays(self) -> None:
-        """Room for the right-hand side of the adjoint solve, and for (u, v) and the anchors at the end of a step."""
-        a, n = self.arrays, self.arrays["nodes"]
-        a["adjoint_rhs"] = a.zeros(n, a.variant.vec3)
-        for name in ("euler_adjoint_rhs", "euler_next"):
-            a[name] = a.zeros(2 * n, a.variant.scalar) if self.scene.sliding else None
-        a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, a.variant.scalar)
-
     def load_inputs(self, stage: int = 0) -> None:
         """Puts pins and applied forces of a stage of this step in place, where they change."""
         a = self.arrays
-        if "applied_force_path" in a:
+        if "forces change" in a.conditions:
             path, values = a["applied_force_path"], a["applied_force"]
             self.launch("load_inputs", len(values), path=path, values=values)
-        if "pin_target_path" in a:
+        if "pins move" in a.conditions:
             arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
             self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
 
@@ -400,18 +395,14 @@ class Model:
         a = self.arrays
         # the reaction of pins that are moved exactly is nowhere at hand
         self.watches = not (self.has_hard_pins and self.scene.pin_path is not None)
-        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 7}
-        for name, count in counts.items():
-            a[name] = a.zeros(count, a.variant.scalar)
-        for name in ("steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
-            a[name] = a.zeros(1, wp.int32)
+        a.make(declarations.ENERGY_WATCH)
         cloth = self.scene.cloth
         lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
         mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
-        a["still_energy"] = a.numbers(0.5 * mass * STILL**2)
+        a.put("still_energy", 0.5 * mass * STILL**2)
         if self._outer:
-            a["outer_force"] = a.zeros(a["nodes"], a.variant.vec3)
-        a["gain"] = a.numbers(BLOW_UP if a.variant.reverse else GAIN)
+            a.make(declarations.OUTER_FORCES)
+        a.put("gain", BLOW_UP if a.variant.reverse else GAIN)
         self.forget_energy()
 
     def forget_energy(self) -> None:
@@ -434,7 +425,7 @@ class Model:
             wp.capture_if(self.arrays["audit_due"], on_true=self._audit)
 
     def _audit(self) -> None:
-        if "pin_motion" in self.arrays:
+        if "pins move" in self.arrays.conditions:
             self.load_inputs(AT_START)
         self.add_contact_load()
         self.arrays.zero("energy", "elastic_energy", "height_energy")
@@ -471,7 +462,7 @@ class Model:
         a = self.arrays
         a.zero(target)
         for term in self._outer:
-            self.launch(term.name, term.elements, matrix=0, add_contact_load=0, force=a[target])
+            self.launch_term(term, matrix=0, add_contact_load=0, force=a[target])
 
     def _add_powers(self) -> None:
         """The power of outer forces and of moving pins at the present state."""
@@ -481,7 +472,7 @@ class Model:
             # the forces go where the solver works
             self._add_outer_forces("q_x")
             self.launch("add_power", "nodes", force=a["q_x"])
-        if "pin_motion" in a and any(term.name == "pins" for term in a.terms):
+        if "pins move" in a.conditions and any(term.name == "pins" for term in a.terms):
             self.launch("add_pin_power", "pins", step_duration=self.step_size)
 
     def _close_step(self, by_stages: bool) -> None:

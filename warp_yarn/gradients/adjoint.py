@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..device import declarations
 from ..device.arrays import STATE_TYPES, arrays_of
 from ..device.model import PATHS
 from ..errors import GradientError, InputError
@@ -33,11 +34,8 @@ class Adjoint:
         self.moving = [name for name in PATHS if name in parameters and f"{name}_path" in a]
         self.wanted = (*STATE_TYPES, *parameters, *(f"{name}_path" for name in self.moving))
         a.require_grad(*self.wanted)
-        for name in STATE_TYPES:
-            # of the loss, by frame of a chunk; (u, v) has one even where it does not change: it may be an input
-            if f"loss_{name}" not in a:
-                array, frames = a[name], simulator.chunk + 1
-                a[f"loss_{name}"] = None if array is None else a.zeros(frames * array.shape[0], array.dtype)
+        # (u, v) has one even where it does not change: it may be an input
+        a.make(declarations.LOSS)
         simulator.integrator.prepare_adjoint(self._add_loss_gradient, self._scatter_gradient)
 
     def _add_loss_gradient(self) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import warp as wp
 
+from ..device import declarations
 from ..device.model import BETWEEN, MATRIX, GraphCache, Model
 
 
@@ -55,8 +56,7 @@ class LinearlyImplicitEuler:
             before, after: launch what a run has to do with adjoints before every step, and after every stage of it.
         """
         model, a = self.model, self.model.arrays
-        if "adjoint_rhs" not in a:
-            model.add_adjoint_arrays()
+        a.make(declarations.ADJOINT)
         a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if model.scene.sliding:
             # s⁺ is the end of the step for friction's anchor too: one running adjoint

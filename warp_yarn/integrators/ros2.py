@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import warp as wp
 
+from ..device import declarations
 from ..device.model import BETWEEN, MATRIX, Model
 from ..kernels.stepping.ros2 import GAMMA
 from .linear import LinearlyImplicitEuler
@@ -46,11 +47,8 @@ class ROS2(LinearlyImplicitEuler):
 
     def __init__(self, model: Model):
         super().__init__(model)
-        a = model.arrays
-        for name in ("first_solution", "increment"):
-            a[name] = a.zeros(a["nodes"], a.variant.vec3)
-            a[f"euler_{name}"] = a.zeros(2 * a["nodes"], a.variant.scalar) if model.scene.sliding else None
-        a["stage_size"] = a.zeros(1, a.variant.scalar)
+        model.arrays.make(declarations.STAGES)
+        model.arrays.make(declarations.FIRST_STAGE)
         self.set_times(model.step_size, model.step_size)
 
     def set_times(self, step: float, remaining: float) -> None:
@@ -92,10 +90,8 @@ class ROS2(LinearlyImplicitEuler):
 
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """As of LinearlyImplicitEuler."""
-        model, a = self.model, self.model.arrays
-        if "stage_adjoint" not in a:
-            a["stage_adjoint"] = a.zeros(a["nodes"], a.variant.vec3)
-            a["euler_stage_adjoint"] = a.zeros(2 * a["nodes"], a.variant.scalar) if model.scene.sliding else None
+        a = self.model.arrays
+        a.make(declarations.CARRIED_ADJOINT)
         a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "increment", "euler_increment", "euler_first_solution")
         self.second_tape = wp.Tape()
         with self.second_tape:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from ..device import declarations
 from ..device.arrays import arrays_of
 from ..device.model import BETWEEN, GraphCache, Model
 from ..kernels.core.status import STALLED
@@ -52,43 +53,13 @@ class StageMethod:
     def __init__(self, model: Model):
         self.model = model
         a = model.arrays
-        vec3, scalar, n = a.variant.vec3, a.variant.scalar, a["nodes"]
-        sliding = model.scene.sliding
-        vectors = ("base_position", "base_velocity", "increment", "direction", "solution_before")
-        rates = ("base_euler_velocity", "euler_increment", "euler_direction", "euler_solution_before")
-        numbers = (
-            "residual_norm", "directional_derivative", "contraction", "kinetic", "last_norm", "change", "first_change",
-            "stage_size", "carried_time", "carried_rate", "newton_tolerance",
-        )  # fmt: skip
-        counts = (
-            "evaluations",
-            "steps",
-            "iterate",
-            "take_unchecked_step",
-            "new_direction",
-            "rebuild_matrix",
-            "order_would_be_lost",
-            "newton_iterations",
-        )
-        for names, count, dtype in (
-            (vectors, n, vec3),
-            (rates, 2 * n if sliding else 0, scalar),
-            (("base_euler",), 2 * n, scalar),
-            (("node_mass",), n, scalar),
-            (numbers, 1, scalar),
-            (counts, 1, wp.int32),
-        ):
-            for name in names:
-                # two methods may work on one model, one after the other
-                if name not in a:
-                    a[name] = a.zeros(count, dtype) if count else None
-        for name, value in (
-            ("unit", 1.0),
-            ("step_length", 1.0),
-            ("shortest", 1e30),
-            ("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE),
-        ):
-            a.setdefault(name, a.numbers(value))
+        a.make(declarations.STAGES)
+        if "base_position" not in a:  # two methods may work on one model, one after the other
+            a.make(declarations.NEWTON_WORKSPACE)
+            a.put("unit", 1.0)
+            a.put("step_length", 1.0)
+            a.put("shortest", 1e30)
+            a.put("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE)
         self.set_times(model.step_size, model.step_size)
         self._graphs = GraphCache(model.device)
 
@@ -148,9 +119,8 @@ class StageMethod:
         accelerations at both stages' times. The second stage starts from the first's gain of velocity, η a₁, so it is
         in proportion to what Newton's iteration adds to that."""
         a = self.model.arrays
-        a["predicted"] = a.zeros(a["nodes"], a.variant.vec3)
-        a["step_error"] = a.zeros(1, a.variant.scalar)
-        a["missing"] = a.numbers(self.local_error / (self.fraction * self.carried))
+        a.make(declarations.ERROR_ESTIMATE)
+        a.put("missing", self.local_error / (self.fraction * self.carried))
 
     @property
     def _is_carried(self) -> bool:
@@ -270,17 +240,17 @@ class StageMethod:
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """As of LinearlyImplicitEuler."""
         model, a = self.model, self.model.arrays
-        vec3, scalar, n, sliding = a.variant.vec3, a.variant.scalar, a["nodes"], model.scene.sliding
-        if "adjoint_rhs" not in a:
-            model.add_adjoint_arrays()
-            for name in ("stage_adjoint", "zero", "first_solution"):
-                a[name] = a.zeros(n, vec3)
-                a[f"euler_{name}"] = a.zeros(2 * n, scalar) if sliding else None
-            a["first_residual_norm"] = a.zeros(1, scalar)
-            a["adjoint_tolerance"] = a.numbers(self._adjoint_tolerance)
+        for group in (
+            declarations.ADJOINT,
+            declarations.CARRIED_ADJOINT,
+            declarations.FIRST_STAGE,
+            declarations.STAGE_ADJOINT,
+        ):
+            a.make(group)
+        a.put("adjoint_tolerance", self._adjoint_tolerance)
         base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
         a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
-        if sliding:
+        if model.scene.sliding:
             a["euler_next"].grad = a["base_euler"].grad
         self.tape, self.anchor_tape, self.pin_tape = wp.Tape(), wp.Tape(), wp.Tape()
         with self.tape:

@@ -601,7 +601,7 @@ class Simulator:
                 a.zero("force", "euler_force", "friction_force_out")
                 if term.name == "friction":
                     a["euler_force"].assign(total)
-                self.model.launch(term.name, term.elements, matrix=0, add_contact_load=0)
+                self.model.launch_term(term, matrix=0, add_contact_load=0)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"
                 along = np.zeros(2 * nodes)
                 if a[out] is not None:
