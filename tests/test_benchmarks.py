@@ -748,7 +748,7 @@ def test_iterations_are_those_of_the_residual_asked_for():
     found = {name: iterations.count(scene, state, 1e-3, name, 1000) for name in iterations.PRECONDITIONERS}
     for preconditioner, counts in found.items():
         simulator = wy.Simulator(scene, step=1e-3, integrator="linear", preconditioner=preconditioner, tolerance=1e-6)
-        simulator.model.watches = False
+        simulator.model.energy.on = False
         simulator.state = state
         simulator.run(1)
         assert counts["to r"] == int(simulator.arrays["iterations"].numpy()[0])

@@ -206,7 +206,7 @@ SCENES = (still, falling, hung, windy, gusty, carried)
 def watched(fabric: str, acts, method: str, sliding: bool, *, watches: bool, step: float = 1e-3) -> wy.Simulator:
     cloth = FABRICS[fabric](rows=5, columns=5, pose="flat")
     simulator = wy.Simulator(wy.Scene(cloth, sliding=sliding, **acts(cloth)), integrator=method, step=step)
-    simulator.model.watches &= watches
+    simulator.model.energy.on &= watches
     return simulator
 
 

@@ -355,7 +355,7 @@ def test_two_cores_do_what_one_does(method: str) -> None:
     scene = wy.paper.hung_cloth("twill", 7, 19, (1, 2))
     one = wy.Simulator(scene, integrator=method).run(4)
     two = wy.Simulator(scene, integrator=method, threads=2)
-    assert two.model.strips == 2
+    assert two.model.threads.count == 2
     # the same operations on every node; sums over nodes are added in another order
     assert np.abs(two.run(4).position - one.position).max() < 1e-12 * scene.cloth.spacing
 
@@ -364,4 +364,4 @@ def test_threads_that_cannot_help_are_refused() -> None:
     with pytest.raises(wy.InputError, match=r"threads = 2, must be 1 .*'jacobi'"):
         wy.Simulator(scene_for("plain", 1), preconditioner="jacobi", threads=2)
     # a cloth too narrow to be shared is solved by one
-    assert wy.Simulator(scene_for("plain", 1), threads=2).model.strips == 1
+    assert wy.Simulator(scene_for("plain", 1), threads=2).model.threads.count == 1

@@ -211,7 +211,7 @@ def test_two_threads_make_the_same_iterates(sliding):
     ends = []
     for threads in (1, 2):
         sim = simulator("handkerchief", 5, 17, sliding, "exact", threads=threads, tolerance=1e-3)
-        assert sim.model.strips == threads
+        assert sim.model.threads.count == threads
         start = sim.state
         start.velocity[:] = np.random.default_rng(3).normal(0.0, 0.1, start.velocity.shape)
         sim.state = start

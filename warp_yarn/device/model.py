@@ -7,22 +7,19 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
-import threading
-import time
-from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, number, whole
 from ..kernels import Term, Variant, build
-from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
-from . import declarations, exclusive
+from . import defaults
 from .arrays import Arrays
+from .defaults import PRECISIONS, PRECONDITIONERS
+from .energy_watch import AT_END, EnergyWatch
+from .threads import Threads
 
 MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
@@ -30,57 +27,10 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-AT_END, AT_START = 2, 3
-"""The places of a step's end and start among ``stage_times``, behind those of two stages."""
 PATHS = ("pin_target", "applied_force")
 """Inputs that may change from step to step."""
-CHEAP_ENERGIES = {
-    "mass": "energy", "stretch": "elastic_energy", "pins": "elastic_energy", "gravity": "height_energy",
-}  # fmt: skip
-"""Terms whose energy is looked at in every step, and the array that it goes to."""
-OUTER_FORCES = ("wind", "applied")
-"""Terms that do work on the cloth and have no energy."""
-NARROWEST_STRIP = 8
-"""Columns; the sweeps need 3 at least, and fewer than these do not pay."""
 SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
 """What differs from one linear solve to another."""
-PRECONDITIONERS = ("multilevel", "incomplete", "jacobi")
-PRECISIONS = {"double": wp.float64, "single": wp.float32}
-TOLERANCES = {"double": 1e-6, "single": 1e-4}
-"""Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
-NEWTON_TOLERANCE = 2e-2
-SLOW = 1e3
-"""k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error
-smaller, as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
-TIGHT = {"double": 1e-2, "single": 1e-1}
-STIFF = 2e4
-"""k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch
-wave runs over a hundred crossings in a step."""
-STIFF_SLIDING = 3.0
-"""The same where friction's damping does not hold the rates of sliding: the incomplete factorization takes their
-diagonal for its pivots, and its sweeps grow from yarn to yarn. On 61 × 61 yarns it "converged" 100 % off from 20 on."""
-HOLDING = 10.0
-"""Times h k_s/L that friction's damping must have to hold the rates."""
-RESOLVED = 4.0
-"""Of steps that do not resolve the yarns' vibrations: a stretch wave runs from a crossing to the next in less than the
-``RESOLVED``-th part of a step. A tenth at most is then added to the error of the second-order methods. The error of
-shorter steps falls with their square, and so does the tolerance in double precision."""
-EXACT = 1e-8
-"""Both tolerances of differentiable runs in double precision: gradients are right to no more digits than these."""
-
-
-class GraphCache(dict[str, Any]):
-    """Launches by name, captured at their first call and replayed from then on: twenty of them cost microseconds."""
-
-    def __init__(self, device: Any):
-        super().__init__()
-        self.device = device
-
-    def run(self, name: str, part: Callable[[], None]) -> None:
-        """Launches what a function launches; the function is called the first time alone."""
-        if name not in self:
-            self[name] = exclusive.capture(self.device, part)
-        exclusive.replay(self[name])
 
 
 class Model:
@@ -93,7 +43,8 @@ class Model:
     Attributes:
         arrays: by the names that kernels use.
         kernels: by name.
-        strips: of the cloth, one a processor core that a linear solve takes.
+        energy: the watch over it.
+        threads: processor cores that share a linear solve.
         has_hard_pins: whether pins are exact.
     """
 
@@ -117,14 +68,14 @@ class Model:
         self.step_size = number("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
         if preconditioner is None:
-            preconditioner = "multilevel" if self._needs_levels() else "incomplete"
+            preconditioner = defaults.preconditioner(scene, self.step_size)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
         exact = differentiable and precision == "double"
-        default = EXACT if exact else TOLERANCES[precision]
-        self.tolerance = number("tolerance", default if tolerance is None else tolerance, above=0.0)
+        if tolerance is None:
+            tolerance = defaults.tolerance(precision, exact=exact)
+        self.tolerance = number("tolerance", tolerance, above=0.0)
         if newton_tolerance is None and exact:
-            newton_tolerance = EXACT
-        self._resolving = self._resolving_rate()
+            newton_tolerance = defaults.EXACT
         self._newton_tolerance = None
         if newton_tolerance is not None:
             self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0)
@@ -141,61 +92,17 @@ class Model:
         self.arrays = Arrays(scene, variant, self.device)
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
-        self._add_ledger()
+        self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
-        self._form_team(whole("threads", threads, least=1))
-
-    def _needs_levels(self) -> bool:
-        """Whether the incomplete factorization takes longer than lines on many levels, or does not work."""
-        cloth, h = self.scene.cloth, self.step_size
-        stretch = h * cloth.stretch_stiffness.max() / cloth.spacing
-        held = "friction" in self.scene.terms and cloth.friction_damping > HOLDING * stretch
-        stiffness = (self._stretch_rate().max() * h) ** 2
-        return stiffness > (STIFF if held or not self.scene.sliding else STIFF_SLIDING)
+        self.threads = Threads(self, whole("threads", threads, least=1))
+        self.arrays.put("tolerance", self.tolerance)
 
     def newton_tolerance_at(self, step: float) -> float:
-        """As given, or what follows the error of steps of this size."""
+        """Give the tolerance that was asked for, or what follows the error of steps of this size [s]."""
         if self._newton_tolerance is not None:
             return self._newton_tolerance
-        fastest = float(self._stretch_rate().max())
-        slow = min(1.0, math.sqrt(SLOW) / (fastest * step)) if fastest > 0.0 else 1.0
-        resolved = min(1.0, step * self._resolving) ** 2
-        return max(EXACT, NEWTON_TOLERANCE * max(TIGHT[self.precision], slow) * resolved)
-
-    def _resolving_rate(self) -> float:
-        """Of steps that begin to resolve the yarns' stretching [1/s]."""
-        rate = self._stretch_rate()
-        if self.precision == "single" or not rate.any():
-            return math.inf
-        return rate[rate > 0.0].min() / RESOLVED
-
-    def _stretch_rate(self) -> np.ndarray:
-        """√(k_s/(m L)) of every material, m the mass of a segment [1/s]."""
-        cloth = self.scene.cloth
-        return np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns]) / cloth.spacing
-
-    def _form_team(self, threads: int) -> None:
-        """Strips of the cloth for so many processor cores (``kernels/linear/threads.py``)."""
-        a = self.arrays
-        if threads > 1 and not (self.device.is_cpu and self.preconditioner != "jacobi"):
-            raise InputError(
-                f"threads = {threads}, must be 1 on {self.device} with the {self.preconditioner!r} preconditioner: "
-                "only the CPU's 'incomplete' and 'multilevel' ones share their work"
-            )
-        columns = self.scene.cloth.weave.columns
-        self.strips = max(1, min(threads, columns // NARROWEST_STRIP))
-        a.sizes |= {"thread": self.strips, "signal": 16 + 16 * self.strips}
-        a.make(declarations.LINEAR_WORKSPACE)
-        a.put("tolerance", self.tolerance)
-        self._team_of(1)
-        if self.strips > 1:
-            a.make(declarations.THREADS_WORKSPACE)
-
-    def _team_of(self, strips: int) -> None:
-        """Begins to count anew, for so many strips."""
-        team = self.arrays["team"]
-        team.assign(np.where(np.arange(len(team)) == 3, strips, 0).astype(np.int32))
+        return defaults.newton_tolerance(self.scene, self.precision, step)
 
     def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
         """The step that kernels make.
@@ -304,47 +211,22 @@ class Model:
             self.launch("factorize_coarsest", 1, first=first, count=end - first)
 
     def solve(self, **replaced: Any) -> None:
-        """The conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
-        a = self.arrays
-        arrays = {name: replaced.get(name, a[name]) for name in SOLVED}
-        kernel = f"{self.preconditioner}_conjugate_gradient"
-        if self.strips == 1:
-            alone = {} if self.preconditioner == "jacobi" else {"strip": 0}
-            self.launch(kernel, 1, most_iterations=self.max_iterations, **alone, **arrays)
-            return
-        # helpers were launched with arrays of their own
-        for name, array in arrays.items():
-            self.copy_array(a[f"team_{name}"], array)
-        self._launch_solve(0)
-        for name in ("solution", "euler_solution"):
-            self.copy_array(arrays[name], a[f"team_{name}"])
+        """Launch the conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
+        arrays = {name: replaced.get(name, self.arrays[name]) for name in SOLVED}
+        if self.threads.count > 1:
+            self.threads.solve(arrays)
+        else:
+            self.launch_solve(0, arrays)
 
-    def _launch_solve(self, strip: int) -> None:
-        arrays = {name: self.arrays[f"team_{name}"] for name in SOLVED}
+    def launch_solve(self, thread: int, arrays: dict[str, Any]) -> None:
+        """Launch the conjugate gradient of one of the threads that share it."""
         kernel = f"{self.preconditioner}_conjugate_gradient"
-        self.launch(kernel, 1, strip=strip, most_iterations=self.max_iterations, **arrays)
+        options = {} if self.preconditioner == "jacobi" else {"strip": thread}
+        self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
 
-    @contextlib.contextmanager
-    def team(self) -> Iterator[None]:
-        """Keeps the other processor cores at hand for linear solves, for as long as a block lasts."""
-        if self.strips == 1:
-            yield
-            return
-        self._team_of(self.strips)
-        team = self.arrays["team"].numpy()  # on the CPU the array itself
-        helpers = []
-        try:
-            for strip in range(1, self.strips):
-                helpers.append(threading.Thread(target=self._launch_solve, args=(strip,), daemon=True))
-                helpers[-1].start()
-                while team[4] != strip and helpers[-1].is_alive():
-                    time.sleep(1e-5)
-            yield
-        finally:
-            team[2] = 1
-            for helper in helpers:
-                helper.join()
-            self._team_of(1)
+    def threads_at_hand(self) -> contextlib.AbstractContextManager[None]:
+        """Keep other processor cores at hand for linear solves, for as long as a block lasts."""
+        return self.threads.at_hand(SOLVED)
 
     def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
@@ -352,19 +234,22 @@ class Model:
         if a["anchor"] is not None:
             self.launch("update_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
 
+    def begin_step(self) -> None:
+        """Look at the energy, if it is time to: what every method begins a step with."""
+        self.energy.begin_step()
+
     def end_step(self, *, by_stages: bool = False) -> None:
         """What every method ends a step with, its end state in place: checks and moves on, and records the frame.
 
         Args:
-            by_stages: whether the method has added up the work of its stages (``add_work``).
+            by_stages: whether the method has added up the work of its stages (``energy.add_work``).
         """
         if self.scene.sliding:
             self.launch("check_order", "segments")
         if "pins move" in self.arrays.conditions:
             # pins are looked at where they are now, not where they were at the last stage's time
             self.load_inputs(AT_END)
-        if self.watches:
-            self._close_step(by_stages)
+        self.energy.end_step(by_stages=by_stages)
         self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
@@ -387,102 +272,3 @@ class Model:
             self.launch("scatter_gradient", len(a[name]), **gradients)
         else:
             self.launch("scatter_gradient_along", "pins", stage=stage, **gradients)
-
-    # -- energy ------------------------------------------------------------------------------------------------------
-
-    def _add_ledger(self) -> None:
-        """Room for the watch over energy (``kernels/stepping/energy_watch.py``)."""
-        a = self.arrays
-        # the reaction of pins that are moved exactly is nowhere at hand
-        self.watches = not (self.has_hard_pins and self.scene.pin_path is not None)
-        a.make(declarations.ENERGY_WATCH)
-        cloth = self.scene.cloth
-        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
-        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
-        a.put("still_energy", 0.5 * mass * STILL**2)
-        if self._outer:
-            a.make(declarations.OUTER_FORCES)
-        a.put("gain", BLOW_UP if a.variant.reverse else GAIN)
-        self.forget_energy()
-
-    def forget_energy(self) -> None:
-        """Begins to watch anew, from the present state on."""
-        for name, value in (("audit_due", 1), ("alert", 0)):
-            self.arrays.put(name, value)
-        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0, 0.0)
-
-    def trust_energy(self) -> None:
-        """Lets all steps pass, until ``forget_energy``: steps that are made again, from the middle of a run, were
-        watched the first time."""
-        a = self.arrays
-        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)
-        a.put("audit_due", 0)
-        a.put("steps_to_audit", np.iinfo(np.int32).max)
-
-    def open_step(self) -> None:
-        """What every method begins a step with: it looks at the energy, if it is time to."""
-        if self.watches:
-            wp.capture_if(self.arrays["audit_due"], on_true=self._audit)
-
-    def _audit(self) -> None:
-        if "pins move" in self.arrays.conditions:
-            self.load_inputs(AT_START)
-        self.add_contact_load()
-        self.arrays.zero("energy", "elastic_energy", "height_energy")
-        self._add_energies(cheap=True)
-        self._add_energies(cheap=False)
-        if self._outer:
-            self._add_outer_forces("outer_force")
-        self.launch("audit", 1)
-
-    def _add_energies(self, *, cheap: bool) -> None:
-        """Energy of the cheap terms, or of the others."""
-        for term in self.arrays.terms:
-            if term.energy is not None and (term.name in CHEAP_ENERGIES) == cheap:
-                energy = self.arrays[CHEAP_ENERGIES.get(term.name, "energy")]
-                self.launch(f"{term.name}_energy", term.elements, energy=energy)
-
-    def begin_work(self) -> None:
-        """Begins to add up the work done in a step."""
-        self.arrays.zero("stage_work")
-
-    def add_work(self, share: float) -> None:
-        """Adds the work that is done at the present state in a share of the step."""
-        if self.watches:
-            self._add_powers()
-            self.launch("add_work", 1, share=share)
-
-    @property
-    def _outer(self) -> list[Term]:
-        """Terms that do work on the cloth and have no energy."""
-        return [term for term in self.arrays.terms if term.name in OUTER_FORCES]
-
-    def _add_outer_forces(self, target: str) -> None:
-        """Fills an array with outer forces at the present state."""
-        a = self.arrays
-        a.zero(target)
-        for term in self._outer:
-            self.launch_term(term, matrix=0, add_contact_load=0, force=a[target])
-
-    def _add_powers(self) -> None:
-        """The power of outer forces and of moving pins at the present state."""
-        a = self.arrays
-        a.zero("power")
-        if self._outer:
-            # the forces go where the solver works
-            self._add_outer_forces("q_x")
-            self.launch("add_power", "nodes", force=a["q_x"])
-        if "pins move" in a.conditions and any(term.name == "pins" for term in a.terms):
-            self.launch("add_pin_power", "pins", step_duration=self.step_size)
-
-    def _close_step(self, by_stages: bool) -> None:
-        """Compares the energy at the end of a step with the work done in it."""
-        a = self.arrays
-        a.zero("energy", "elastic_energy", "height_energy")
-        self._add_energies(cheap=True)
-        self.launch("suspect", 1)
-        wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
-        self._add_powers()
-        self.launch("close_step", 1, by_stages=int(by_stages))
-        if self._outer:
-            self.launch("keep_outer_force", "nodes", force=a["q_x"])

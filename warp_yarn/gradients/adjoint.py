@@ -71,7 +71,7 @@ class Adjoint:
         """
         a = self.arrays
         a.put("counters", steps, before + first + steps)
-        with self.simulator.model.team():
+        with self.simulator.model.threads_at_hand():
             for k in range(steps, 0, -1):
                 self.simulator.integrator.backward_step()
                 if a["status"].numpy()[0]:

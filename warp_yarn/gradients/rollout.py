@@ -353,7 +353,7 @@ class Rollout:
 
     def _restart(self, kept: Mapping[str, torch.Tensor], first: int) -> None:
         """Puts the state that a chunk starts from back."""
-        self.simulator.model.trust_energy()
+        self.simulator.model.energy.trust()
         for name, source in kept.items():
             _flat(self.simulator.arrays[name]).copy_(source[first // self.checkpoint_every].reshape(-1))
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import warp as wp
 
 from ..device import declarations
-from ..device.model import BETWEEN, MATRIX, GraphCache, Model
+from ..device.graphs import GraphCache
+from ..device.model import BETWEEN, MATRIX, Model
 
 
 class LinearlyImplicitEuler:
@@ -36,7 +37,7 @@ class LinearlyImplicitEuler:
 
     def _step(self) -> None:
         model = self.model
-        model.open_step()
+        model.begin_step()
         model.load_inputs()
         model.assemble()
         # The last velocity is the start: a step changes it little.

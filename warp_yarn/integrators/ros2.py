@@ -59,7 +59,7 @@ class ROS2(LinearlyImplicitEuler):
     def _step(self) -> None:
         model, a = self.model, self.model.arrays
         first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
-        model.open_step()
+        model.begin_step()
         model.load_inputs()
         self._assemble_first()
         model.copy(first_solution="velocity", euler_first_solution="euler_velocity")

@@ -9,7 +9,8 @@ import warp as wp
 
 from ..device import declarations
 from ..device.arrays import arrays_of
-from ..device.model import BETWEEN, GraphCache, Model
+from ..device.graphs import GraphCache
+from ..device.model import BETWEEN, Model
 from ..kernels.core.status import STALLED
 
 STATE = ("position", "euler", "velocity", "euler_velocity")
@@ -96,7 +97,7 @@ class StageMethod:
                 if estimates:
                     model.copy(predicted="solution")
             self._newton(stage)
-            model.add_work(self._shares[stage])
+            model.energy.add_work(self._shares[stage])
         if estimates:
             model.launch("estimate_error", 1)
         if self._is_carried:
@@ -135,8 +136,8 @@ class StageMethod:
     def _begin(self) -> None:
         """The stage starts from the present state, at the present velocity."""
         model = self.model
-        model.open_step()
-        model.begin_work()
+        model.begin_step()
+        model.energy.begin_work()
         model.load_inputs()
         model.arrays.zero("newton_iterations", "node_mass")
         model.launch("lump_mass", "segments")

@@ -19,7 +19,8 @@ import warp as wp
 from ..description.scene import Scene
 from ..device.arrays import STATE_TYPES, YARN_PARAMETERS
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
-from ..device.model import GraphCache, Model
+from ..device.graphs import GraphCache
+from ..device.model import Model
 from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels.core import status
@@ -180,7 +181,7 @@ class Simulator:
                 threads=threads,
                 differentiable=differentiable,
             )
-            self.model.watches = self.model.watches and bool(energy_watch)
+            self.model.energy.on = self.model.energy.on and bool(energy_watch)
             refuse_recording(self.model.device)
             self._options["device"] = str(self.model.device)
             self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
@@ -273,7 +274,7 @@ class Simulator:
         if self._recording is not None:
             self._recording.open = False
         # pins may be elsewhere then, which is no gain of energy
-        self._owed = self.model.forget_energy
+        self._owed = self.model.energy.forget
         self._pay()
         self._steps_done = steps
 
@@ -296,7 +297,7 @@ class Simulator:
 
         def begin() -> None:
             self._upload(state)
-            self.model.forget_energy()
+            self.model.energy.forget()
             self.parts.size = 1.0
             if steps_done is not None:
                 self._steps_done, self.split_steps, self.damped_steps = steps_done, {}, set()
@@ -397,8 +398,8 @@ class Simulator:
                 with ALONE, compiling():
                     refuse_recording(self.model.device)
                     self._settle()
-                    if self.model.strips > 1:
-                        uninterrupted(lambda: self._team.enter_context(self.model.team()))
+                    if self.model.threads.count > 1:
+                        uninterrupted(lambda: self._team.enter_context(self.model.threads_at_hand()))
                 return self._make_chunk(steps)
             finally:
                 self._end_team()
@@ -425,7 +426,7 @@ class Simulator:
         return made
 
     def _end_team(self) -> None:
-        if self.model.strips > 1:
+        if self.model.threads.count > 1:
             uninterrupted(self._team.close)
 
     def _count(self, frame: int) -> None:
