@@ -239,8 +239,8 @@ def test_the_iteration_that_is_not_looked_at_gets_there(step: float) -> None:
         simulator.run(1)
         skipped += int(arrays["take_unchecked_step"].numpy()[0])
         change = float(arrays["change"].numpy()[0])
-        simulator.integrator._evaluate(matrix=True)
-        simulator.integrator._solve_direction(1)
+        simulator.integrator.newton.evaluate(matrix=True)
+        simulator.integrator.newton.solve_direction(1)
         slope = float(arrays["directional_derivative"].numpy()[0])
         left.append(np.sqrt(slope) / change / simulator.model.newton_tolerance_at(step))
     assert skipped >= 5

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..device import declarations
-from ..device.arrays import STATE_TYPES, arrays_of
+from ..device.arrays import STATE_TYPES
+from ..device.declared import arrays_of
 from ..device.model import PATHS
 from ..errors import GradientError, InputError
 from ..kernels.core.status import NOT_FINITE

@@ -1,29 +1,14 @@
-"""What implicit methods share: a stage, solved by Newton's iteration (``kernels/nonlinear``), and its adjoint."""
+"""What implicit methods share: a step of stages, each solved by Newton's iteration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-import warp as wp
-
 from ..device import declarations
-from ..device.arrays import arrays_of
 from ..device.graphs import GraphCache
-from ..device.model import BETWEEN, Model
-from ..kernels.core.status import STALLED
-
-STATE = ("position", "euler", "velocity", "euler_velocity")
-MOVED = (*STATE, "increment", "euler_increment")
-"""Arrays of the stage that w moves."""
-
-INNER_TOLERANCE = 1e-2
-"""Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
-would not come nearer to the stage's."""
-INNER_TOLERANCE_FREE = 1e-3
-"""The same of a cloth that nothing holds: what is left of its momentum adds up from step to step."""
-MOST_PARTS = 100
-"""Of GMRES, each kept as a vector."""
+from ..device.model import Model
+from .newton import Newton
+from .stage_adjoint import StageAdjoint
 
 
 class StageMethod:
@@ -32,13 +17,6 @@ class StageMethod:
     The first stage starts from the present state (q, q̇). What it leads to is carried by t = carried · h, to
     q + t w₁ and q̇ + t (w₁ − q̇)/η: there a second stage starts, or the step ends if there is none. Where carried is 0
     the stage itself ends the step, and so does a second stage.
-
-    Newton's iteration ends with the step that leaves less than newton_tolerance of the change of velocity, by what the
-    steps before it left: looking at where it led would only confirm it (``check_convergence`` in
-    ``kernels/nonlinear/newton.py``, ``docs/solver.md``).
-    Along δ it takes a full step unless that overshoots: r·δ is minus the slope of the energy that
-    a stage minimizes, where there is one, and must not turn to more than 0.9 of itself with the other sign, or else ‖r‖
-    must fall. (That it always falls is too much to ask of yarns that buckle.) Nor may crossings change their order.
     """
 
     name: str
@@ -53,14 +31,7 @@ class StageMethod:
 
     def __init__(self, model: Model):
         self.model = model
-        a = model.arrays
-        a.make(declarations.STAGES)
-        if "base_position" not in a:  # two methods may work on one model, one after the other
-            a.make(declarations.NEWTON_WORKSPACE)
-            a.put("unit", 1.0)
-            a.put("step_length", 1.0)
-            a.put("shortest", 1e30)
-            a.put("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE)
+        self.newton = Newton(model)
         self.set_times(model.step_size, model.step_size)
         self._graphs = GraphCache(model.device)
 
@@ -73,17 +44,9 @@ class StageMethod:
         a.put("carried_time", self.carried * step)
         a.put("carried_rate", self.carried / self.fraction)
 
-    # -- graphs ------------------------------------------------------------------------------------------------------
-
-    def _run(self, part: Callable[[], None]) -> None:
-        """Launches a part of the step."""
-        self._graphs.run(part.__name__, part)
-
-    # -- forward -----------------------------------------------------------------------------------------------------
-
     def advance(self) -> None:
         """Makes a step, and records it: one captured graph, whose loops end on the device."""
-        self._run(self._step)
+        self._graphs.run("forward", self._step)
 
     def _step(self) -> None:
         model = self.model
@@ -96,11 +59,11 @@ class StageMethod:
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
                 if estimates:
                     model.copy(predicted="solution")
-            self._newton(stage)
+            self.newton.solve(stage)
             model.energy.add_work(self._shares[stage])
         if estimates:
             model.launch("estimate_error", 1)
-        if self._is_carried:
+        if self.is_carried:
             model.launch("next_base", "nodes", start=None)
             self.model.copy(
                 position="base_position",
@@ -124,7 +87,7 @@ class StageMethod:
         a.put("missing", self.local_error / (self.fraction * self.carried))
 
     @property
-    def _is_carried(self) -> bool:
+    def is_carried(self) -> bool:
         """Whether what the only stage leads to is carried to the step's end."""
         return self.stages == 1 and self.carried > 0.0
 
@@ -143,9 +106,9 @@ class StageMethod:
         model.launch("lump_mass", "segments")
         model.copy(solution="velocity", euler_solution="euler_velocity")
         model.set_pin_velocity()
-        self._set_base()
+        self.set_base()
 
-    def _set_base(self) -> None:
+    def set_base(self) -> None:
         self.model.copy(
             base_position="position",
             base_euler="euler",
@@ -153,317 +116,11 @@ class StageMethod:
             base_euler_velocity="euler_velocity",
         )
 
-    def _evaluate(self, *, matrix: bool) -> None:
-        """The residual at w, and the matrix if asked for."""
-        self.model.launch("enter_stage", "nodes")
-        self._assemble(matrix=matrix)
-        if matrix:
-            self.model.factorize()
-
-    def _assemble(self, *, matrix: bool) -> None:
-        a = self.model.arrays
-        mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
-        self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
-
-    def _newton(self, stage: int) -> None:
-        """Solves a stage. Its matrix is that of its start until convergence is slow: another state's differs less
-        from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
-        turn."""
-        a = self.model.arrays
-        a.zero("evaluations", "steps", "direction", "euler_direction")
-        if self.model.scene.sliding:
-            a.zero("order_would_be_lost")
-            self.model.launch("check_initial_guess", "segments")
-            wp.capture_if(a["order_would_be_lost"], on_true=lambda: a.zero("euler_solution"))
-        if stage == 0:
-            self._evaluate(matrix=True)
-        else:
-            self._evaluate_as_asked()
-        self._control()
-        wp.capture_while(a["iterate"], lambda: self._iterate(stage))
-
-    def _evaluate_as_asked(self) -> None:
-        wp.capture_if(
-            self.model.arrays["rebuild_matrix"],
-            on_true=lambda: self._evaluate(matrix=True),
-            on_false=lambda: self._evaluate(matrix=False),
-        )
-
-    def _control(self) -> None:
-        if self.model.scene.sliding:
-            self.model.launch("shortest_segment", "segments")
-        self.model.launch("control_newton", 1)
-
-    def _iterate(self, stage: int) -> None:
-        a = self.model.arrays
-        a.zero("take_unchecked_step")
-        wp.capture_if(a["new_direction"], on_true=lambda: self._solve_direction(stage))
-        self.model.launch("apply_step", "nodes")
-        wp.capture_if(a["take_unchecked_step"], on_true=self._finish_stage, on_false=self._check)
-
-    def _finish_stage(self) -> None:
-        """Ends with the last step, without a look at where it led."""
-        self.model.launch("enter_stage", "nodes")
-        self.model.arrays.zero("iterate")
-
-    def _check(self) -> None:
-        self._evaluate_as_asked()
-        self._control()
-
-    def _solve_direction(self, stage: int) -> None:
-        """δ, from A δ = r."""
-        a = self.model.arrays
-        a.zero("direction", "euler_direction")
-        if not len(self.model.scene.pins):
-            self.model.launch("start_rigid", 1)
-        self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
-        self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
-        self.model.launch("begin_line_search", 1)
-        if self.model.scene.sliding:
-            self.model.launch("limit_step_length", "segments")
-        self.model.launch("check_convergence", 1, stage=stage)
-
-    @property
-    def _rounding(self) -> float:
-        return 1e-16 if self.model.precision == "double" else 1e-7
-
-    @property
-    def _adjoint_tolerance(self) -> float:
-        return max(self.model.tolerance, 10.0 * self._rounding)
-
-    def _stall(self, residual: float) -> None:
-        a = self.model.arrays
-        a.put("residual", residual)
-        a.put("status", STALLED, -1, 0)
-
-    # -- adjoint -----------------------------------------------------------------------------------------------------
-
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """As of LinearlyImplicitEuler."""
-        model, a = self.model, self.model.arrays
-        for group in (
-            declarations.ADJOINT,
-            declarations.CARRIED_ADJOINT,
-            declarations.FIRST_STAGE,
-            declarations.STAGE_ADJOINT,
-        ):
-            a.make(group)
-        a.put("adjoint_tolerance", self._adjoint_tolerance)
-        base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
-        a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
-        if model.scene.sliding:
-            a["euler_next"].grad = a["base_euler"].grad
-        self.tape, self.anchor_tape, self.pin_tape = wp.Tape(), wp.Tape(), wp.Tape()
-        with self.tape:
-            self._assemble(matrix=False)
-        with self.anchor_tape:
-            model.update_anchor("euler_next", "anchor_next")
-        with self.pin_tape:
-            model.set_pin_velocity(position=a["base_position"])
-        self._around = before, after
-        self._added = self._arrays_added_to()
-        for name in self._graphs.keys() - {"_step"}:
-            del self._graphs[name]
+        self._adjoint = StageAdjoint(self, before, after)
+        self.tape = self._adjoint.tape
 
     def backward_step(self) -> None:
-        """As of LinearlyImplicitEuler; (−∂r/∂w)ᵀ λ = w̄ is solved to the linear tolerance, with the exact derivative."""
-        self._run(self._restore)
-        self._run(self._enter_last)
-        self._solve_adjoint()
-        if self.stages == 2:
-            self._run(self._enter_first)
-            self._solve_adjoint()
-        self._run(self._finish)
-
-    def _restore(self) -> None:
-        """The step that ends at the present frame; the running adjoints go to the base."""
-        model, a = self.model, self.model.arrays
-        before, _ = self._around
-        before()
-        model.launch("count", 1, by=-1)
-        model.launch("restore_frame", "nodes")
-        model.load_inputs(self.stages - 1)
-        self._set_base()
-        if self._is_carried:
-            model.launch("recall_carried_stage", "nodes")
-        if self.stages == 2:
-            model.launch("recall_first_stage", "nodes")
-            first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
-            model.launch("next_base", "nodes", start=None, **first)
-        model.copy(**{f"base_{name}_grad": f"{name}_grad" for name in STATE})
-        a.zero_grad("solution")
-
-    def _enter_last(self) -> None:
-        """The stage that ended the step, and w̄ of the step's end."""
-        model, a = self.model, self.model.arrays
-        self._enter()
-        if a["anchor"] is not None:
-            model.copy(anchor_next_grad="anchor_grad")
-            a.zero_grad("anchor", "rhs", "euler_rhs")
-            self.anchor_tape.backward()
-            self.tape.backward()
-        if self._is_carried:
-            model.launch("carry_adjoint", "nodes", time=a["carried_time"], rate=a["carried_rate"])
-        else:
-            model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
-
-    def _enter_first(self) -> None:
-        """The stage before it, and w̄ of what it carried to the next."""
-        model, a = self.model, self.model.arrays
-        _, after = self._around
-        after(1)
-        model.load_inputs()
-        model.launch("restore_frame", "nodes")
-        self._set_base()
-        self.model.copy(solution="first_solution", euler_solution="euler_first_solution")
-        self._enter()
-        model.launch("carry_adjoint", "nodes", time=a["carried_time"], rate=a["carried_rate"])
-
-    def _enter(self) -> None:
-        self.model.arrays.zero_grad(*MOVED, *BETWEEN)
-        self.model.launch("enter_stage", "nodes")
-        self._assemble(matrix=True)
-        self.model.factorize()
-
-    def _solve_adjoint(self) -> None:
-        """λ of (−∂r/∂w)ᵀ λ = ρ₀: reverse mode with all of it, and its share of the adjoints of q₀ and v₀."""
-        a = self.model.arrays
-        self._run(self._descend)
-        size, first = (float(a[name].numpy()[0]) for name in ("residual_norm", "first_residual_norm"))
-        if not size <= self._adjoint_tolerance * first and not a["status"].numpy()[0]:
-            self._minimize(size, first)
-        self._run(self._add_stage_adjoint)
-
-    def _descend(self) -> None:
-        """Parts of λ, each A⁻¹ ρ of what the parts before it left, as long as they more than halve ρ.
-
-        Reverse mode adds to what it has added for the parts before: in the end it has run for all of λ.
-        """
-        a = self.model.arrays
-        a.zero("evaluations")
-        self._gather()
-        self.model.launch("control_adjoint", 1)
-        wp.capture_while(a["iterate"], self._descend_once)
-
-    def _descend_once(self) -> None:
-        self._solve_part()
-        self._reverse()
-        self._gather()
-        self.model.launch("control_adjoint", 1)
-
-    def _minimize(self, left: float, first: float) -> None:
-        """What is left of λ, from a ρ of this size, by GMRES with the preconditioner A; ``first`` was that of ρ₀.
-
-        Where yarns slide fast, A alone need not contract.
-        """
-        a = self.model.arrays
-        rho = self._vector("adjoint_rhs")
-        # Products with the derivative run all of reverse mode: what it adds to is put back, and added to at the end.
-        kept = {name: a[name].grad.numpy().copy() for name in self._added}
-        weight = np.sqrt(self._vector("inverse_x", "inverse_s"))
-        basis, parts, columns = [], [], []
-        combination, size = np.zeros(0), left
-        while size > self._adjoint_tolerance * first:
-            if len(parts) == MOST_PARTS or not np.isfinite(size) or a["status"].numpy()[0]:
-                self._stall(size / first)
-                return
-            if not basis:
-                basis.append(weight * rho / left)
-            self._set_vector("adjoint_rhs", basis[-1] / np.where(weight > 0.0, weight, 1.0))
-            self._run(self._solve_part)
-            parts.append(self._vector("rhs", gradient=True))
-            self._run(self._product)
-            image = -weight * self._vector("adjoint_rhs")
-            # modified Gram-Schmidt, twice: once loses what GMRES needs of orthogonality near the end
-            column = np.zeros(len(basis))
-            for _ in range(2):
-                for k, vector in enumerate(basis):
-                    share = float(vector @ image)
-                    column[k] += share
-                    image -= share * vector
-            norm = float(np.linalg.norm(image))
-            columns.append(np.append(column, norm))
-            hessenberg = np.zeros((len(columns) + 1, len(columns)))
-            for k, entries in enumerate(columns):
-                hessenberg[: len(entries), k] = entries
-            target = np.zeros(len(columns) + 1)
-            target[0] = left
-            combination = np.linalg.lstsq(hessenberg, target, rcond=None)[0]
-            size = float(np.linalg.norm(hessenberg @ combination - target))
-            if norm == 0.0:
-                break
-            basis.append(image / norm)
-        for name, values in kept.items():
-            a[name].grad.assign(values)
-        total = sum((c * part for c, part in zip(combination, parts, strict=True)), np.zeros_like(rho))
-        self._set_vector("rhs", total, gradient=True)
-        self._run(self._reverse)
-        self._run(self._gather)
-
-    def _vector(self, *names: str, gradient: bool = False) -> np.ndarray:
-        """An array of the positions and its companion of (u, v), as one vector; named by the first, or by both."""
-        total = []
-        for name in names if len(names) == 2 else (names[0], f"euler_{names[0]}"):
-            array = self.model.arrays[name]
-            if array is not None:
-                total.append((array.grad if gradient else array).numpy().astype(np.float64).ravel())
-        return np.concatenate(total)
-
-    def _set_vector(self, name: str, values: np.ndarray, *, gradient: bool = False) -> None:
-        at = 0
-        for part in (name, f"euler_{name}"):
-            array = self.model.arrays[part]
-            if array is not None:
-                target = array.grad if gradient else array
-                count = target.numpy().size
-                target.assign(values[at : at + count].reshape(target.numpy().shape))
-                at += count
-
-    def _arrays_added_to(self) -> tuple[str, ...]:
-        """Arrays whose gradients reverse mode adds to: the stage's own, friction's anchors and the parameters."""
-        between = {*BETWEEN, "rhs", "euler_rhs"}
-        arrays = (array for launch in self.tape.launches for array in arrays_of(launch))
-        pointers = {array.ptr for array in arrays if array.grad is not None}
-        a = self.model.arrays
-        return tuple(
-            name
-            for name, array in a.items()
-            if isinstance(array, wp.array) and array.grad is not None and array.ptr in pointers and name not in between
-        )
-
-    def _gather(self) -> None:
-        """ρ = w̄ + (∂r/∂w)ᵀ λ, of what reverse mode has gathered."""
-        self.model.launch("stage_adjoint_residual", "nodes")
-
-    def _solve_part(self) -> None:
-        a = self.model.arrays
-        a.zero_grad("rhs", "euler_rhs")
-        part = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
-        self.model.solve(tolerance=a["inner_tolerance"], rhs=a["adjoint_rhs"], euler_rhs=a["euler_adjoint_rhs"], **part)
-
-    def _product(self) -> None:
-        """(∂r/∂w)ᵀ of the part in the gradient of the right-hand side."""
-        a = self.model.arrays
-        a.zero_grad(*MOVED)
-        self._reverse()
-        zero = {"stage_adjoint": a["zero"], "euler_stage_adjoint": a["euler_zero"]}
-        self.model.launch("stage_adjoint_residual", "nodes", **zero)
-
-    def _reverse(self) -> None:
-        self.model.arrays.zero_grad(*BETWEEN)
-        self.tape.backward()
-
-    def _add_stage_adjoint(self) -> None:
-        model, a = self.model, self.model.arrays
-        if model.has_hard_pins:
-            # what is held has no λ: its row of ρ is the adjoint of the velocity that holds it
-            a.zero("q_x")
-            model.launch("hard_pin_adjoint", "pins")
-        model.launch("absorb_stage", "nodes")
-
-    def _finish(self) -> None:
-        if self.model.has_hard_pins:
-            self.pin_tape.backward()
-        self.model.copy(**{f"{name}_grad": f"base_{name}_grad" for name in STATE})
-        _, after = self._around
-        after(0)
+        """As of LinearlyImplicitEuler."""
+        self._adjoint.backward_step()
