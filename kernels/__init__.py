@@ -9,9 +9,15 @@ import functools
 import warp as wp
 
 from .core.variant import Term, Variant
-from .linear import block_matrix, conjugate_gradient, incomplete_cholesky, multilevel
-from .nonlinear import newton
-from .stepping import energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
+from .linear import (
+    block_matrix,
+    conjugate_gradient,
+    incomplete_cholesky,
+    multilevel,
+    multilevel_conjugate_gradient,
+)
+from .nonlinear import line_search, newton
+from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
 from .terms import (
     applied_force,
     bending,
@@ -71,7 +77,10 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
         incomplete_cholesky,
         conjugate_gradient,
         multilevel,
+        multilevel_conjugate_gradient,
+        dirk,
         newton,
+        line_search,
         energy_watch,
         frames,
         linear_adjoint,

@@ -11,7 +11,7 @@ Of q, row i has given the rows behind it its part of Uᵀ (t − E⁻¹q) when t
 there is to do with a node's vectors while they are at hand, and of the diagonal blocks the iteration reads D once and
 E⁻¹ twice, E never. They count their columns by hand: the object that Warp makes of a range costs 3 % of a step.
 
-``team.py`` tells how processor cores share the sweeps.
+``threads.py`` tells how processor cores share the sweeps.
 """
 
 import functools
@@ -23,8 +23,8 @@ from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
 from . import block_matrix, incomplete_cholesky
-from . import threads as teams
-from .threads import call, ended, keep_pace, meet, share, wait_for_call
+from . import threads as synchronization
+from .threads import barrier, begin_solve, ended, keep_pace, partition, wait_for_solve
 
 
 @functools.cache
@@ -41,16 +41,16 @@ def define(variant: Variant) -> SimpleNamespace:
         incomplete_cholesky.functions(variant).symmetric,
         incomplete_cholesky.functions(variant).product,
     )
-    total = teams.functions(variant).total
+    total = synchronization.functions(variant).total
     module = variant.module("conjugate_gradient")
     variant.fuse("conjugate_gradient")
 
     @wp.func
     def backward_sweep(
-        strip: int,
-        strips: int,
+        thread: int,
+        threads: int,
         swept: int,
-        team: wp.array(dtype=int),
+        signals: wp.array(dtype=int),
         nodes: int,
         columns: int,
         blocks: BlockMatrix,
@@ -59,9 +59,9 @@ def define(variant: Variant) -> SimpleNamespace:
         beta: scalar,
         work: SolverWork,
     ) -> scalar:
-        """p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a strip, and its part of t·A t."""
-        first = share(columns, strip, strips)
-        width = share(columns, strip + 1, strips) - first
+        """p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a thread's columns, and their part of t·A t."""
+        first = partition(columns, thread, threads)
+        width = partition(columns, thread + 1, threads) - first
         rows = nodes / columns
         curvature = scalar(0.0)
         for row in range(rows):
@@ -69,8 +69,8 @@ def define(variant: Variant) -> SimpleNamespace:
             begin = (rows - 1 - row) * columns + first
             column = width - 1
             while column >= 0:
-                if strips > 1:
-                    keep_pace(team, strip, strip + 1, strip - 1, strips, width - 1 - column, width, swept + row)
+                if threads > 1:
+                    keep_pace(signals, thread, thread + 1, thread - 1, threads, width - 1 - column, width, swept + row)
                 i = begin + column
                 w, w_u, w_v = gather(i, blocks, work.t_x, work.t_s)
                 p = load(work.r_x, i) + load(work.p_x, i) * beta
@@ -98,16 +98,16 @@ def define(variant: Variant) -> SimpleNamespace:
                 store(work.q_x, i, q)
                 curvature += wp.dot(t, q + w)
                 column -= 1
-            if strips > 1:
-                ended(team, strip, swept + row + 1)
+            if threads > 1:
+                ended(signals, thread, swept + row + 1)
         return curvature
 
     @wp.func
     def forward_sweep(
-        strip: int,
-        strips: int,
+        thread: int,
+        threads: int,
         swept: int,
-        team: wp.array(dtype=int),
+        signals: wp.array(dtype=int),
         nodes: int,
         columns: int,
         blocks: BlockMatrix,
@@ -118,9 +118,9 @@ def define(variant: Variant) -> SimpleNamespace:
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
     ) -> scalar:
-        """q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a strip, and its part of r·E⁻¹r."""
-        first = share(columns, strip, strips)
-        width = share(columns, strip + 1, strips) - first
+        """q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a thread's columns, and their part of r·E⁻¹r."""
+        first = partition(columns, thread, threads)
+        width = partition(columns, thread + 1, threads) - first
         rz = scalar(0.0)
         y_u = scalar(0.0)
         y_v = scalar(0.0)
@@ -128,8 +128,8 @@ def define(variant: Variant) -> SimpleNamespace:
             begin = row * columns + first
             column = int(0)
             while column < width:
-                if strips > 1:
-                    keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
+                if threads > 1:
+                    keep_pace(signals, thread, thread - 1, thread + 1, threads, column, width, swept + row)
                 i = begin + column
                 inverse = load(inverse_pivot, i)
                 t = load(work.t_x, i)
@@ -157,14 +157,14 @@ def define(variant: Variant) -> SimpleNamespace:
                 store(work.r_x, i, r)
                 rz += wp.dot(r, product(inverse, r))
                 column += 1
-            if strips > 1:
-                ended(team, strip, swept + row + 1)
+            if threads > 1:
+                ended(signals, thread, swept + row + 1)
         return rz
 
     @wp.kernel(module=module, enable_backward=False)
     def incomplete_conjugate_gradient(
-        strip: int,
-        team: wp.array(dtype=int),
+        thread: int,
+        signals: wp.array(dtype=int),
         # matrix
         nodes: int,
         columns: int,
@@ -182,32 +182,32 @@ def define(variant: Variant) -> SimpleNamespace:
         work: SolverWork,
         report: SolveReport,
     ):
-        """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch of one thread a strip.
+        """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch a thread.
 
-        Strip 0 solves once; others are helpers that wait for one solve after the other until they are sent home.
+        Thread 0 solves once; others are helpers that wait for one solve after the other until they are to end.
         What is held has an E⁻¹ of 0: it keeps its value, and enters the right-hand side through the first residual.
         """
         zero = scalar(0.0)
-        strips = team[3]
-        begin = share(nodes, strip, strips)
-        end = share(nodes, strip + 1, strips)
-        first = share(columns, strip, strips)
-        width = share(columns, strip + 1, strips) - first
+        threads = signals[3]
+        begin = partition(nodes, thread, threads)
+        end = partition(nodes, thread + 1, threads)
+        first = partition(columns, thread, threads)
+        width = partition(columns, thread + 1, threads) - first
         rows = nodes / columns
         number = int(0)
         stays = bool(True)
-        if strip == 0 and strips > 1:
-            call(team)
+        if thread == 0 and threads > 1:
+            begin_solve(signals)
         while stays:
-            if strip == 0:
+            if thread == 0:
                 stays = False
             else:
-                wait_for_call(team, number, strip)
+                wait_for_solve(signals, number, thread)
                 number += 1
-                if team[2] != 0:
+                if signals[2] != 0:
                     break
-            met = team[5] + strips
-            swept = team[16 + 16 * strip]
+            arrived = signals[5] + threads
+            swept = signals[16 + 16 * thread]
             start = zero
             for i in range(begin, end):
                 store(work.r_x, i, load(rhs, i))
@@ -218,7 +218,7 @@ def define(variant: Variant) -> SimpleNamespace:
                         store(work.r_s, s, load(euler_rhs, s))
                         store(work.p_s, s, zero)
                         start += load(euler_solution, s) * load(euler_solution, s)
-            start = total(start, 0, strip, strips, met, team, work.sums)
+            start = total(start, 0, thread, threads, arrived, signals, work.sums)
             # r = E (E + U)⁻ᵀ (b − A x)
             rz = zero
             u = zero
@@ -228,8 +228,8 @@ def define(variant: Variant) -> SimpleNamespace:
             for row in range(rows):
                 column = int(0)
                 while column < width:
-                    if strips > 1:
-                        keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
+                    if threads > 1:
+                        keep_pace(signals, thread, thread - 1, thread + 1, threads, column, width, swept + row)
                     i = row * columns + first + column
                     inverse = load(inverse_pivot, i)
                     x = vec3()
@@ -266,11 +266,11 @@ def define(variant: Variant) -> SimpleNamespace:
                         y + x, y_u + u, y_v + v, work.r_x, work.r_s,
                     )  # fmt: skip
                     column += 1
-                if strips > 1:
-                    ended(team, strip, swept + row + 1)
+                if threads > 1:
+                    ended(signals, thread, swept + row + 1)
             swept += rows
-            rz = total(rz, 1, strip, strips, met + strips, team, work.sums)
-            met += strips
+            rz = total(rz, 1, thread, threads, arrived + threads, signals, work.sums)
+            arrived += threads
             size = rz
 
             limit = tolerance[0] * tolerance[0] * size
@@ -278,28 +278,28 @@ def define(variant: Variant) -> SimpleNamespace:
             beta = zero
             while count < most_iterations and rz > limit:
                 curvature = backward_sweep(
-                    strip, strips, swept, team, nodes, columns, blocks,
+                    thread, threads, swept, signals, nodes, columns, blocks,
                     inverse_pivot, inverse_s, beta, work,
                 )  # fmt: skip
-                curvature = total(curvature, 3, strip, strips, met + strips, team, work.sums)
+                curvature = total(curvature, 3, thread, threads, arrived + threads, signals, work.sums)
                 swept += rows
-                met += strips
+                arrived += threads
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break
                 rz_next = forward_sweep(
-                    strip, strips, swept, team, nodes, columns, blocks, inverse_pivot, inverse_s,
+                    thread, threads, swept, signals, nodes, columns, blocks, inverse_pivot, inverse_s,
                     rz / curvature, work, solution, euler_solution,
                 )  # fmt: skip
-                rz_next = total(rz_next, 4, strip, strips, met + strips, team, work.sums)
+                rz_next = total(rz_next, 4, thread, threads, arrived + threads, signals, work.sums)
                 swept += rows
-                met += strips
+                arrived += threads
                 beta = rz_next / rz
                 rz = rz_next
                 count += 1
-            if strips > 1:
-                meet(team, met + strips)
-            if strip == 0:
+            if threads > 1:
+                barrier(signals, arrived + threads)
+            if thread == 0:
                 if write_report(count, rz, size, limit, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):

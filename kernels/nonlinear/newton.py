@@ -1,11 +1,6 @@
-"""An implicit stage: the velocity w at which momentum is conserved at the state that w itself leads to.
+"""Newton's iteration on an implicit stage (``stepping/dirk.py``): its start, its control and when to take a new matrix.
 
-    r(w) = η F(q, w) + M(q) (v₀ − w) = 0,   q = q₀ + η w
-
-Every implicit method here is made of such stages, and of q₀ + t w and v₀ + k (w − v₀) that carry one to the next or to
-the end of a step (``warp_yarn/integrators``). Newton's iteration takes A, the symmetric positive definite part of
-−∂r/∂w, for its matrix: M + η D + η² H. The adjoint of a stage that has converged is (−∂r/∂w)ᵀ λ = w̄, with the exact
-derivative (``stage_adjoint.py``).
+It takes A, the symmetric positive definite part of −∂r/∂w, for its matrix: M + η D + η² H.
 """
 
 import functools
@@ -13,9 +8,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import coordinates, ends, index
+from ..core.indexing import ends, index
 from ..core.memory import functions as access
-from ..core.status import NOT_FINITE, ORDER_LOST, STALLED, fail
+from ..core.status import NOT_FINITE, STALLED
 from ..core.structs import structs
 from ..core.variant import Variant
 
@@ -25,12 +20,6 @@ that violent sliding brings them to dozens."""
 SHORTEST_STEP = 2.0**-24
 """Of the line search: where crossings nearly touch, or l and Δs shrink together, which costs next to no energy, it must
 be short indeed."""
-NEAREST = 0.1
-"""Part of a Δs that a step of the iteration leaves of it at least."""
-EXTRAPOLATED = 0.5
-"""Part of a Δs that must be left where a first stage is extrapolated to the second one's base, else the step is split:
-where crossings fly at each other, the second stage would begin inside the barrier, and gain several times the energy
-of the start."""
 TURNED = 0.9
 """Part of the slope that a step of the iteration may turn to with the other sign (``integrators/stage.py``)."""
 SLOW = 0.3
@@ -57,86 +46,6 @@ def define(variant: Variant) -> SimpleNamespace:
     module = variant.module("stage")
 
     @wp.kernel(module=module, enable_backward=False)
-    def enter_stage(
-        stage_size: wp.array(dtype=scalar),
-        base_position: wp.array(dtype=vec3),
-        base_euler: wp.array(dtype=scalar),
-        base_velocity: wp.array(dtype=vec3),
-        base_euler_velocity: wp.array(dtype=scalar),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-        position: wp.array(dtype=vec3),
-        euler: wp.array(dtype=scalar),
-        velocity: wp.array(dtype=vec3),
-        euler_velocity: wp.array(dtype=scalar),
-        increment: wp.array(dtype=vec3),
-        euler_increment: wp.array(dtype=scalar),
-    ):
-        """q = q₀ + η w, q̇ = w, and v₀ − w, whose momentum the residual has."""
-        i = index(wp.tid())
-        w = solution[i]
-        position[i] = base_position[i] + w * stage_size[0]
-        velocity[i] = w
-        increment[i] = base_velocity[i] - w
-        if wp.static(sliding):
-            for d in range(2):
-                s = 2 * i + d
-                rate = euler_solution[s]
-                euler[s] = base_euler[s] + rate * stage_size[0]
-                euler_velocity[s] = rate
-                euler_increment[s] = base_euler_velocity[s] - rate
-
-    @wp.kernel(module=module, enable_backward=False)
-    def check_initial_guess(
-        segments: wp.array(dtype=wp.vec4i),
-        stage_size: wp.array(dtype=scalar),
-        euler: wp.array(dtype=scalar),
-        base_euler: wp.array(dtype=scalar),
-        euler_solution: wp.array(dtype=scalar),
-        order_would_be_lost: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-    ):
-        """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
-        has them much nearer to each other than the first stage left them."""
-        a, _b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
-        rest = base_euler[sb] - base_euler[sa]
-        if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
-            order_would_be_lost[0] = 1
-        if rest < scalar(EXTRAPOLATED) * (euler[sb] - euler[sa]):
-            fail(status, wp.static(ORDER_LOST), a)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def apply_step(
-        step_length: wp.array(dtype=scalar),
-        solution_before: wp.array(dtype=vec3),
-        euler_solution_before: wp.array(dtype=scalar),
-        direction: wp.array(dtype=vec3),
-        euler_direction: wp.array(dtype=scalar),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-    ):
-        """w + α δ."""
-        i = index(wp.tid())
-        solution[i] = solution_before[i] + direction[i] * step_length[0]
-        if wp.static(sliding):
-            for d in range(2):
-                s = 2 * i + d
-                euler_solution[s] = euler_solution_before[s] + euler_direction[s] * step_length[0]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def lump_mass(
-        segments: wp.array(dtype=wp.vec4i),
-        density: wp.array(dtype=scalar),
-        euler: wp.array(dtype=scalar),
-        node_mass: wp.array(dtype=scalar),
-    ):
-        """Half of every segment's mass to each of its nodes."""
-        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
-        m = scalar(0.5) * density[yarn] * (euler[sb] - euler[sa])
-        wp.atomic_add(node_mass, a, m)
-        wp.atomic_add(node_mass, b, m)
-
-    @wp.kernel(module=module, enable_backward=False)
     def start_rigid(
         nodes: int,
         node_mass: wp.array(dtype=scalar),
@@ -153,50 +62,13 @@ def define(variant: Variant) -> SimpleNamespace:
             store(direction, i, momentum / mass)
 
     @wp.kernel(module=module, enable_backward=False)
-    def begin_line_search(
-        nodes: int,
-        node_mass: wp.array(dtype=scalar),
-        rhs: wp.array(dtype=vec3),
-        euler_rhs: wp.array(dtype=scalar),
-        direction: wp.array(dtype=vec3),
-        euler_direction: wp.array(dtype=scalar),
-        is_free: wp.array(dtype=int),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-        base_velocity: wp.array(dtype=vec3),
-        base_euler_velocity: wp.array(dtype=scalar),
-        control: NewtonControl,
-    ):
-        """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, and of the change of velocity
-        g = w + δ − v₀ that it leads to, g·M g."""
-        total = scalar(0.0)
-        square = scalar(0.0)
-        for i in range(nodes):
-            d = load(direction, i)
-            total += wp.dot(load(rhs, i), d)
-            gain = vec3()
-            if is_free[i] != 0:
-                gain = load(solution, i) + d - load(base_velocity, i)
-            along = scalar(0.0)
-            if wp.static(sliding):
-                for s in range(2 * i, 2 * i + 2):
-                    d_s = load(euler_direction, s)
-                    total += load(euler_rhs, s) * d_s
-                    gain_s = load(euler_solution, s) + d_s - load(base_euler_velocity, s)
-                    along += scalar(0.5) * gain_s * gain_s
-            square += load(node_mass, i) * (wp.dot(gain, gain) + along)
-        control.directional_derivative[0] = total
-        control.kinetic[0] = square
-        control.step_length[0] = scalar(1.0)
-
-    @wp.kernel(module=module, enable_backward=False)
     def check_convergence(
         stage: int,
         residual: wp.array(dtype=scalar),
         control: NewtonControl,
         status: wp.array(dtype=int),
     ):
-        """Whether the step along δ is the last one: what it leaves is small beside how much velocities change.
+        """Choose whether the step along δ is the last one: what it leaves is small beside how much velocities change.
 
         ‖δ‖ is in the norm of A, √(δ·A δ) = √(r·δ), which is more than that of M, and the change in that of M: kinetic
         energy. What it leaves is taken from the contraction.
@@ -228,8 +100,8 @@ def define(variant: Variant) -> SimpleNamespace:
         if norm == scalar(0.0) or (control.step_length[0] == scalar(1.0) and small):
             control.take_unchecked_step[0] = 1
 
-    @wp.kernel(module=module, enable_backward=False)
-    def control_newton(
+    @wp.func
+    def norms(
         nodes: int,
         is_free: wp.array(dtype=int),
         inverse_x: wp.array(dtype=vec3),
@@ -240,11 +112,8 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_direction: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
-        stage_size: wp.array(dtype=scalar),
-        control: NewtonControl,
-        status: wp.array(dtype=int),
     ):
-        """Whether Newton's iteration goes on from w, takes back half of the way to w, or cannot go further.
+        """Add up ‖r‖, what the rounding of 1 in positions makes of it, and r·δ, of what is free.
 
         ‖r‖ is in the norm of A's inverse diagonal, the mean of each node's, so that it is the same in every frame.
         """
@@ -272,9 +141,41 @@ def define(variant: Variant) -> SimpleNamespace:
                         of_rhs += inverse_along * r_s * r_s
                         of_rounding += load(euler, s) * load(euler, s) / inverse_along
                         turned += r_s * load(euler_direction, s)
-        now = wp.sqrt(of_rhs)
+        return wp.sqrt(of_rhs), wp.sqrt(of_rounding), turned
+
+    @wp.func
+    def not_finite(
+        nodes: int, is_free: wp.array(dtype=int), rhs: wp.array(dtype=vec3), inverse_x: wp.array(dtype=vec3)
+    ) -> int:
+        """Find a node whose residual or matrix is not finite, or -1."""
+        found = int(-1)
+        for i in range(nodes):
+            if is_free[i] != 0 and not (wp.isfinite(rhs[i]) and wp.min(inverse_x[i]) > scalar(0.0)):
+                found = i
+        return found
+
+    @wp.kernel(module=module, enable_backward=False)
+    def control_newton(
+        nodes: int,
+        is_free: wp.array(dtype=int),
+        inverse_x: wp.array(dtype=vec3),
+        inverse_s: wp.array(dtype=scalar),
+        rhs: wp.array(dtype=vec3),
+        euler_rhs: wp.array(dtype=scalar),
+        direction: wp.array(dtype=vec3),
+        euler_direction: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        control: NewtonControl,
+        status: wp.array(dtype=int),
+    ):
+        """Choose what is next at w: to stop, to iterate, to halve the step of the line search, or to fail."""
+        now, rounding, turned = norms(
+            nodes, is_free, inverse_x, inverse_s, rhs, euler_rhs, direction, euler_direction, position, euler
+        )
         # velocities that positions are too coarse to tell from 0
-        rounding = wp.sqrt(of_rounding) * scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
+        rounding *= scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
         before = control.residual_norm[0]
         first = control.evaluations[0] == 0
         control.evaluations[0] = control.evaluations[0] + 1
@@ -308,10 +209,7 @@ def define(variant: Variant) -> SimpleNamespace:
         elif not wp.isfinite(before):
             control.iterate[0] = 0
             status[0] = wp.static(NOT_FINITE)
-            status[1] = -1
-            for i in range(nodes):
-                if is_free[i] != 0 and not (wp.isfinite(rhs[i]) and wp.min(inverse_x[i]) > scalar(0.0)):
-                    status[1] = i
+            status[1] = not_finite(nodes, is_free, rhs, inverse_x)
         elif stalled and control.iterate[0] != 0:
             control.iterate[0] = 0
             # what rounding leaves cannot be taken away; nor is there a need to where the last step was small enough
@@ -319,31 +217,6 @@ def define(variant: Variant) -> SimpleNamespace:
             if not (small or before <= rounding * scalar(wp.static(ROUNDING))):
                 status[0] = wp.static(STALLED)
                 status[1] = -1
-
-    @wp.kernel(module=module, enable_backward=False)
-    def shortest_segment(
-        segments: wp.array(dtype=wp.vec4i),
-        euler: wp.array(dtype=scalar),
-        shortest: wp.array(dtype=scalar),
-    ):
-        sa, sb = coordinates(segments, index(wp.tid()))
-        wp.atomic_min(shortest, 0, euler[sb] - euler[sa])
-
-    @wp.kernel(module=module, enable_backward=False)
-    def limit_step_length(
-        segments: wp.array(dtype=wp.vec4i),
-        stage_size: wp.array(dtype=scalar),
-        euler: wp.array(dtype=scalar),
-        euler_direction: wp.array(dtype=scalar),
-        step_length: wp.array(dtype=scalar),
-    ):
-        """Shortens the step along δ so far that it leaves something of every Δs."""
-        sa, sb = coordinates(segments, index(wp.tid()))
-        rest = euler[sb] - euler[sa]
-        loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
-        allowed = rest * scalar(wp.static(1.0 - NEAREST))
-        if loss > allowed and rest > scalar(0.0):
-            wp.atomic_min(step_length, 0, allowed / loss)
 
     @wp.kernel(module=module, enable_backward=False)
     def ask_for_matrix(
@@ -359,64 +232,9 @@ def define(variant: Variant) -> SimpleNamespace:
         if moved > scalar(wp.static(TURNING)) * spacing[0]:
             rebuild_matrix[0] = 1
 
-    @wp.kernel(module=module, enable_backward=False)
-    def next_base(
-        carried_time: wp.array(dtype=scalar),
-        carried_rate: wp.array(dtype=scalar),
-        is_free: wp.array(dtype=int),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-        start: wp.array(dtype=vec3),
-        base_position: wp.array(dtype=vec3),
-        base_euler: wp.array(dtype=scalar),
-        base_velocity: wp.array(dtype=vec3),
-        base_euler_velocity: wp.array(dtype=scalar),
-    ):
-        """q₀ + t w and v₀ + k (w − v₀): from a stage's base to the next stage's, which starts from the same gain of
-        velocity if asked for one. Sliding rates start from those of the stage before: they have next to no inertia."""
-        i = index(wp.tid())
-        w = solution[i]
-        gain = w - base_velocity[i]
-        v0 = base_velocity[i] + gain * carried_rate[0]
-        base_position[i] = base_position[i] + w * carried_time[0]
-        base_velocity[i] = v0
-        if start and is_free[i] != 0:
-            start[i] = v0 + gain
-        if wp.static(sliding):
-            for d in range(2):
-                s = 2 * i + d
-                rate = euler_solution[s]
-                gain_s = rate - base_euler_velocity[s]
-                base_euler[s] = base_euler[s] + rate * carried_time[0]
-                base_euler_velocity[s] += gain_s * carried_rate[0]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def estimate_error(
-        nodes: int,
-        step_size: wp.array(dtype=scalar),
-        missing: wp.array(dtype=scalar),
-        predicted: wp.array(dtype=vec3),
-        solution: wp.array(dtype=vec3),
-        step_error: wp.array(dtype=scalar),
-    ):
-        """Of the node that is farthest off: h · missing · |w₂ − what the first stage's acceleration led to|."""
-        most = scalar(0.0)
-        for i in range(nodes):
-            most = wp.max(most, wp.length_sq(load(solution, i) - load(predicted, i)))
-        step_error[0] = wp.sqrt(most) * missing[0] * step_size[0]
-
     return SimpleNamespace(
-        enter_stage=enter_stage,
-        check_initial_guess=check_initial_guess,
-        apply_step=apply_step,
-        lump_mass=lump_mass,
         start_rigid=start_rigid,
-        begin_line_search=begin_line_search,
         check_convergence=check_convergence,
         control_newton=control_newton,
-        shortest_segment=shortest_segment,
-        limit_step_length=limit_step_length,
         ask_for_matrix=ask_for_matrix,
-        next_base=next_base,
-        estimate_error=estimate_error,
     )

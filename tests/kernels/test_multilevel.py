@@ -46,7 +46,7 @@ def apply(sim: wy.Simulator, r: np.ndarray) -> np.ndarray:
     if sim.scene.sliding:
         a["euler_rhs"].assign(r[n:])
     arrays = {name: a[name] for name in SOLVED}
-    sim.model.launch("multilevel_conjugate_gradient", 1, strip=0, most_iterations=0, **arrays)
+    sim.model.launch("multilevel_conjugate_gradient", 1, thread=0, most_iterations=0, **arrays)
     a.zero("status")
     parts = [a["t_x"].numpy().ravel()]
     if sim.scene.sliding:

@@ -180,7 +180,7 @@ LINEAR_WORKSPACE: Group = {
     "t_x": Field("node", 1, "vec3", "m/s", "always", "preconditioned residual or direction"),
     "t_s": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
     "sums": Field("thread", 5, "scalar", "J", "always", "parts of scalar products"),
-    "team": Field("signal", 1, "int", "", "always", "where threads wait for each other (linear/threads.py)"),
+    "signals": Field("signal", 1, "int", "", "always", "where threads wait for each other (linear/threads.py)"),
     "tolerance": Field("world", 1, "scalar", "", "always", "of the residual, relative to the start's"),
     "iterations": Field("world", 1, "int", "", "always", "of the last solve"),
     "residual": Field("world", 1, "scalar", "", "always", "where the last solve, or Newton's iteration, ended"),
@@ -188,11 +188,11 @@ LINEAR_WORKSPACE: Group = {
 """What linear solves work with, and their report."""
 
 THREADS_WORKSPACE: Group = {
-    "team_rhs": Field("node", 1, "vec3", "N s", "always", "what helping threads were launched with in its place"),
-    "team_euler_rhs": Field("node", 2, "scalar", "N s", "sliding", "the same of (u, v)"),
-    "team_tolerance": Field("world", 1, "scalar", "", "always", "the same of the tolerance"),
-    "team_solution": Field("node", 1, "vec3", "m/s", "always", "the same of the solution"),
-    "team_euler_solution": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
+    "helper_rhs": Field("node", 1, "vec3", "N s", "always", "what helping threads were launched with in its place"),
+    "helper_euler_rhs": Field("node", 2, "scalar", "N s", "sliding", "the same of (u, v)"),
+    "helper_tolerance": Field("world", 1, "scalar", "", "always", "the same of the tolerance"),
+    "helper_solution": Field("node", 1, "vec3", "m/s", "always", "the same of the solution"),
+    "helper_euler_solution": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
 }
 """Of solves that several threads share."""
 
@@ -346,7 +346,7 @@ LAUNCH: Group = {
     "along": Field("launch", 1, "int", "", "always", "direction of lines: 0 warp, 1 weft"),
     "first": Field("launch", 1, "int", "", "always", "first node of a level"),
     "count": Field("launch", 1, "int", "", "always", "nodes of a level"),
-    "strip": Field("launch", 1, "int", "", "always", "which thread of a shared solve, from 0"),
+    "thread": Field("launch", 1, "int", "", "always", "which thread of a shared solve, from 0"),
     "most_iterations": Field("launch", 1, "int", "", "always", "of a linear solve"),
     "by": Field("launch", 1, "int", "", "always", "steps to count, 1 or -1"),
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),

@@ -221,7 +221,7 @@ class Model:
     def launch_solve(self, thread: int, arrays: dict[str, Any]) -> None:
         """Launch the conjugate gradient of one of the threads that share it."""
         kernel = f"{self.preconditioner}_conjugate_gradient"
-        options = {} if self.preconditioner == "jacobi" else {"strip": thread}
+        options = {} if self.preconditioner == "jacobi" else {"thread": thread}
         self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
 
     def threads_at_hand(self) -> contextlib.AbstractContextManager[None]:

@@ -53,7 +53,7 @@ class Threads:
 
     def _begin_anew(self, count: int) -> None:
         """Begin to count signals anew, for so many threads."""
-        signals = self.model.arrays["team"]
+        signals = self.model.arrays["signals"]
         signals.assign(np.where(np.arange(len(signals)) == COUNT, count, 0).astype(np.int32))
 
     def solve(self, arrays: dict[str, Any]) -> None:
@@ -66,7 +66,7 @@ class Threads:
             model.copy_array(arrays[name], own[name])
 
     def _own(self, names: Any) -> dict[str, Any]:
-        return {name: self.model.arrays[f"team_{name}"] for name in names}
+        return {name: self.model.arrays[f"helper_{name}"] for name in names}
 
     @contextlib.contextmanager
     def at_hand(self, names: tuple[str, ...]) -> Iterator[None]:
@@ -79,7 +79,7 @@ class Threads:
             yield
             return
         self._begin_anew(self.count)
-        signals = self.model.arrays["team"].numpy()  # on the CPU the array itself
+        signals = self.model.arrays["signals"].numpy()  # on the CPU the array itself
         helpers = []
         try:
             for thread in range(1, self.count):
