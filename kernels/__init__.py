@@ -53,7 +53,7 @@ TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
 
 @functools.cache
 def build(variant: Variant) -> dict[str, wp.Kernel]:
-    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
+    """Build every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """

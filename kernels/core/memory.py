@@ -35,7 +35,8 @@ _ROWS = """
 
 
 def rows(variant: Variant, snippet: str) -> str:
-    """A function's C++ with the variant's scalar in place of SCALAR, 1 or 0 in place of SLIDING, and a ``row`` of four.
+    """Make a function's C++ with the variant's scalar in place of SCALAR, 1 or 0 in place of SLIDING, and a ``row`` of
+    four.
 
     The row of a 3 × 3 block has three: the fourth is the next number in memory, and counts for nothing. Behind every
     block with a neighbour stands another, for the last node has no upper neighbour.
@@ -46,7 +47,7 @@ def rows(variant: Variant, snippet: str) -> str:
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """``load(array, i)`` and ``store(array, i, value)``, of every type that the solver's arrays have."""
+    """Make ``load(array, i)`` and ``store(array, i, value)``, of every type that the solver's arrays have."""
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
 
     @wp.func_native(_READ)

@@ -21,7 +21,7 @@ class Variant:
 
     @property
     def forward(self) -> "Variant":
-        """The variant without reverse mode, of kernels that never need it."""
+        """Give the variant without reverse mode, of kernels that never need it."""
         return dataclasses.replace(self, reverse=False)
 
     @property
@@ -34,11 +34,11 @@ class Variant:
 
     @property
     def sym33(self) -> type:
-        """A symmetric matrix: 00, 01, 02, 11, 12, 22."""
+        """Give the type of a symmetric matrix: 00, 01, 02, 11, 12, 22."""
         return wp.types.vector(6, self.scalar)
 
     def module(self, name: str) -> str:
-        """Name of the Warp module that this variant's kernels of one kind are compiled into.
+        """Name the Warp module that this variant's kernels of one kind are compiled into.
 
         One module a variant: typing.Any kernels would rebuild their module at every new instantiation.
         """

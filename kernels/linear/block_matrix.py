@@ -105,7 +105,7 @@ _SPREAD = """
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
+    """Make what both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     vec5 = wp.types.vector(5, scalar)
     load, store = memory.functions(variant).load, memory.functions(variant).store
@@ -113,7 +113,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def times(m: mat33, x: vec3) -> vec3:
-        """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
+        """Compute m x. By rows, as they lie in memory: Warp's own product goes by columns."""
         return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
 
     @wp.func_native(memory.rows(variant, _GATHER))
@@ -131,7 +131,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         x: wp.array(dtype=vec3),
         s: wp.array(dtype=scalar),
     ):
-        """Row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
+        """Add up row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
         y = gather_together(i, blocks, x, s)
         return vec3(y[0], y[1], y[2]), y[3], y[4]
 
@@ -145,7 +145,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         y_x: wp.array(dtype=vec3),
         y_s: wp.array(dtype=scalar),
     ):
-        """y −= Uᵀ (x, u, v), what row i of U gives to others."""
+        """Add up y −= Uᵀ (x, u, v), what row i of U gives to others."""
         ...
 
     @wp.func
@@ -157,7 +157,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         q_x: wp.array(dtype=vec3),
         q_s: wp.array(dtype=scalar),
     ):
-        """q += A p. One pass: a row adds its upper half to itself, and the transposed blocks to its neighbours."""
+        """Add up q += A p. One pass: a row adds its upper half to itself, and the transposed blocks to its
+        neighbours."""
         u = scalar(0.0)
         v = scalar(0.0)
         for i in range(nodes):
@@ -209,7 +210,7 @@ def define(variant: Variant) -> SimpleNamespace:
         q_x: wp.array(dtype=vec3),
         q_s: wp.array(dtype=scalar),
     ):
-        """q += A p."""
+        """Add up q += A p."""
         multiply(
             nodes, blocks, p_x, p_s, q_x, q_s,
         )  # fmt: skip
@@ -232,7 +233,8 @@ def define(variant: Variant) -> SimpleNamespace:
         work: SolverWork,
         report: SolveReport,
     ):
-        """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch of one thread.
+        """Solve A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch of one
+        thread.
 
         What is held still has an inverse diagonal of 0, so it keeps its value, enters the right-hand side through
         the first residual, and its row of the residual is what holding it takes.

@@ -59,7 +59,8 @@ def define(variant: Variant) -> SimpleNamespace:
         beta: scalar,
         work: SolverWork,
     ) -> scalar:
-        """p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a thread's columns, and their part of t·A t."""
+        """Sweep backwards: p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a thread's columns, and their part of t·A
+        t."""
         first = partition(columns, thread, threads)
         width = partition(columns, thread + 1, threads) - first
         rows = nodes / columns
@@ -118,7 +119,8 @@ def define(variant: Variant) -> SimpleNamespace:
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
     ) -> scalar:
-        """q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a thread's columns, and their part of r·E⁻¹r."""
+        """Sweep forwards: q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a thread's columns, and their part of
+        r·E⁻¹r."""
         first = partition(columns, thread, threads)
         width = partition(columns, thread + 1, threads) - first
         rz = scalar(0.0)
@@ -182,7 +184,7 @@ def define(variant: Variant) -> SimpleNamespace:
         work: SolverWork,
         report: SolveReport,
     ):
-        """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch a thread.
+        """Solve A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch a thread.
 
         Thread 0 solves once; others are helpers that wait for one solve after the other until they are to end.
         What is held has an E⁻¹ of 0: it keeps its value, and enters the right-hand side through the first residual.

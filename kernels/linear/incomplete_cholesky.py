@@ -51,7 +51,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def product(m: sym33, x: vec3) -> vec3:
-        """m x."""
+        """Compute m x."""
         return vec3(
             m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
             m[1] * x[0] + m[3] * x[1] + m[4] * x[2],
@@ -63,12 +63,12 @@ def functions(variant: Variant) -> SimpleNamespace:
         m: sym33, i: int, stencil: int, neighbour: wp.array(dtype=int), upper_xx: wp.array(dtype=mat33),
         pivot: wp.array(dtype=sym33),
     ):  # fmt: skip
-        """pivot −= bᵀ m b of the neighbours of a node, b its blocks."""
+        """Correct pivots, pivot −= bᵀ m b of the neighbours of a node, b its blocks."""
         ...
 
     @wp.func
     def inverse_of(m: sym33) -> sym33:
-        """Inverse of a positive definite matrix; 0 where it is not safely so."""
+        """Invert a positive definite matrix; 0 where it is not safely so."""
         c00 = m[3] * m[5] - m[4] * m[4]
         c01 = m[2] * m[4] - m[1] * m[5]
         c02 = m[1] * m[4] - m[2] * m[3]
@@ -103,7 +103,7 @@ def define(variant: Variant) -> SimpleNamespace:
         upper_xx: wp.array(dtype=mat33),
         inverse_pivot: wp.array(dtype=sym33),
     ):
-        """E⁻¹ of the positions, E being added up in its place; 0 for what is held, which keeps it out.
+        """Compute E⁻¹ of the positions, E being added up in its place; 0 for what is held, which keeps it out.
 
         Sliding coordinates keep their diagonal: friction's damping dominates it, and their share of E changes the
         iterations by less than one.

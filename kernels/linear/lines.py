@@ -270,7 +270,8 @@ def _snippet(variant: Variant, text: str, unknowns: int) -> str:
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """Factorize or solve one line: ``nodes`` of the cloth, with rates where yarns slide, or ``coarse`` ones."""
+    """Make what factorizes or solves one line: ``nodes`` of the cloth, with rates where yarns slide, or ``coarse``
+    ones."""
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
     unknowns = 4 if variant.sliding else 3
     BlockMatrix = structs(variant).BlockMatrix
@@ -317,7 +318,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         z_x: wp.array(dtype=vec3),
         z_s: wp.array(dtype=scalar),
     ):
-        """z += L⁻¹ r of a line of the cloth; of rates z = L⁻¹ r, each of which is on one line alone."""
+        """Add up z += L⁻¹ r of a line of the cloth; of rates z = L⁻¹ r, each of which is on one line alone."""
         ...
 
     @wp.func_native(_snippet(variant, _SOLVE, 3))
@@ -331,7 +332,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         r_x: wp.array(dtype=vec3),
         z_x: wp.array(dtype=vec3),
     ):
-        """z += L⁻¹ r of a line of a coarse level."""
+        """Add up z += L⁻¹ r of a line of a coarse level."""
         ...
 
     return SimpleNamespace(

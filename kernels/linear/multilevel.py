@@ -38,7 +38,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def solve_coarsest(levels: Levels, first: int, count: int):
-        """z of the last level."""
+        """Solve for z of the last level."""
         size = 3 * count
         for i in range(size):
             node = first + i / 3
@@ -57,7 +57,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def restrict(levels: Levels, below: wp.array(dtype=vec3), begin: int, end: int):
-        """r of coarse nodes from the level below, and the start of their z."""
+        """Compute r of coarse nodes from the level below, and the start of their z."""
         for i in range(begin, end):
             r = vec3()
             for k in range(load(levels.child_start, i), load(levels.child_start, i + 1)):
@@ -67,7 +67,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def interpolated(levels: Levels, i: int) -> vec3:
-        """z of a node's parents at the node; ``i`` counts the cloth's nodes and then coarse ones."""
+        """Interpolate z of a node's parents at the node; ``i`` counts the cloth's nodes and then coarse ones."""
         result = vec3()
         for k in range(4 * i, 4 * i + 4):
             j = load(levels.parent, k)
@@ -80,7 +80,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         thread: int, threads: int, arrived: int, signals: wp.array(dtype=int), nodes: int, levels: Levels,
         r_x: wp.array(dtype=vec3), r_s: wp.array(dtype=scalar), z_x: wp.array(dtype=vec3), z_s: wp.array(dtype=scalar),
     ) -> scalar:  # fmt: skip
-        """z = P⁻¹ r, its part of r·z; z is to start at − ½ D⁻¹ r. Comes to ``barriers(levels)`` barriers."""
+        """Compute z = P⁻¹ r, its part of r·z; z is to start at − ½ D⁻¹ r. Comes to ``barriers(levels)`` barriers."""
         count = levels.coarse_levels
         for level in range(count):
             if threads > 1:
@@ -165,7 +165,7 @@ def define(variant: Variant) -> SimpleNamespace:
         levels: Levels,
         blocks: BlockMatrix,
     ):
-        """A block of RᵀAR of a level, those of the level below being there."""
+        """Compute a block of RᵀAR of a level, those of the level below being there."""
         block = levels.blocks_per_node * first + wp.tid()
         result = mat33()
         for k in range(load(levels.block_start, block), load(levels.block_start, block + 1)):
@@ -194,7 +194,7 @@ def define(variant: Variant) -> SimpleNamespace:
         is_crossing: wp.array(dtype=int),
         levels: Levels,
     ):
-        """Every line of the cloth along one direction; warp yarns come first."""
+        """Factorize every line of the cloth along one direction; warp yarns come first."""
         k = wp.tid() + along * levels.warp_lines
         factorize_nodes(
             along, load(levels.line_start, k), load(levels.line_start, k + 1), levels.line_node,
@@ -203,7 +203,7 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def factorize_coarse_lines(along: int, levels: Levels):
-        """Every line of the coarse levels along one direction."""
+        """Factorize every line of the coarse levels along one direction."""
         k = wp.tid() + along * levels.coarse_warp_lines
         factorize_coarse(
             along, load(levels.coarse_line_start, k), load(levels.coarse_line_start, k + 1),
@@ -213,7 +213,7 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def factorize_coarsest(first: int, count: int, levels: Levels):
-        """The Cholesky factor of the last level, row by row, with the inverse of its diagonal."""
+        """Compute the Cholesky factor of the last level, row by row, with the inverse of its diagonal."""
         size = 3 * count
         lower = levels.coarsest
         for i in range(count):

@@ -97,7 +97,7 @@ def define(variant: Variant) -> SimpleNamespace:
         q_x: wp.array(dtype=vec3),
         q_s: wp.array(dtype=scalar),
     ) -> scalar:
-        """q = A x of a node, and its part of x·A x."""
+        """Compute q = A x of a node, and its part of x·A x."""
         ...
 
     @wp.kernel(module=module, enable_backward=False)
@@ -119,7 +119,7 @@ def define(variant: Variant) -> SimpleNamespace:
         work: SolverWork,
         report: SolveReport,
     ):
-        """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch a thread.
+        """Solve A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch a thread.
 
         Thread 0 solves once; others are helpers that wait for one solve after the other until they are to end.
         What is held has a row of 0 in P⁻¹: it keeps its value.

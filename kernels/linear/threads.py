@@ -145,7 +145,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         signals: wp.array(dtype=int),
         sums: wp.array(dtype=scalar),
     ) -> scalar:
-        """The sum over the threads, when all have come to it."""
+        """Add up the sum over the threads, when all have come to it."""
         if threads == 1:
             return mine
         sums[threads * slot + thread] = mine

@@ -36,8 +36,8 @@ def define(variant: Variant) -> SimpleNamespace:
         order_would_be_lost: wp.array(dtype=int),
         status: wp.array(dtype=int),
     ):
-        """Whether crossings would pass each other at the velocity that the iteration starts from, and whether the base
-        has them much nearer to each other than the first stage left them."""
+        """Check whether crossings would pass each other at the velocity that the iteration starts from, and whether the
+        base has them much nearer to each other than the first stage left them."""
         a, _b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
         rest = base_euler[sb] - base_euler[sa]
         if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
@@ -117,7 +117,7 @@ def define(variant: Variant) -> SimpleNamespace:
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
     ):
-        """w + α δ."""
+        """Take the step, w + α δ."""
         i = index(wp.tid())
         solution[i] = solution_before[i] + direction[i] * step_length[0]
         if wp.static(sliding):

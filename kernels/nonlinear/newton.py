@@ -52,7 +52,8 @@ def define(variant: Variant) -> SimpleNamespace:
         rhs: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
     ):
-        """δ of a free cloth that moves as one: the solver need not find how it falls, to its tolerance."""
+        """Start δ as that of a free cloth that moves as one: the solver need not find how it falls, to its
+        tolerance."""
         momentum = vec3()
         mass = scalar(0.0)
         for i in range(nodes):

@@ -40,7 +40,7 @@ def define(variant: Variant) -> SimpleNamespace:
         increment: wp.array(dtype=vec3),
         euler_increment: wp.array(dtype=scalar),
     ):
-        """q = q₀ + η w, q̇ = w, and v₀ − w, whose momentum the residual has."""
+        """Place q = q₀ + η w, q̇ = w, and v₀ − w, whose momentum the residual has."""
         i = index(wp.tid())
         w = solution[i]
         position[i] = base_position[i] + w * stage_size[0]
@@ -61,7 +61,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler: wp.array(dtype=scalar),
         node_mass: wp.array(dtype=scalar),
     ):
-        """Half of every segment's mass to each of its nodes."""
+        """Add half of every segment's mass to each of its nodes."""
         a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         m = scalar(0.5) * density[yarn] * (euler[sb] - euler[sa])
         wp.atomic_add(node_mass, a, m)
@@ -80,8 +80,9 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity: wp.array(dtype=vec3),
         base_euler_velocity: wp.array(dtype=scalar),
     ):
-        """q₀ + t w and v₀ + k (w − v₀): from a stage's base to the next stage's, which starts from the same gain of
-        velocity if asked for one. Sliding rates start from those of the stage before: they have next to no inertia."""
+        """Carry on to q₀ + t w and v₀ + k (w − v₀): from a stage's base to the next stage's, which starts from the same
+        gain of velocity if asked for one. Sliding rates start from those of the stage before: they have next to no
+        inertia."""
         i = index(wp.tid())
         w = solution[i]
         gain = w - base_velocity[i]
@@ -107,7 +108,8 @@ def define(variant: Variant) -> SimpleNamespace:
         solution: wp.array(dtype=vec3),
         step_error: wp.array(dtype=scalar),
     ):
-        """Of the node that is farthest off: h · missing · |w₂ − what the first stage's acceleration led to|."""
+        """Estimate the error of the node that is farthest off: h · missing · |w₂ − what the first stage's acceleration
+        led to|."""
         most = scalar(0.0)
         for i in range(nodes):
             most = wp.max(most, wp.length_sq(load(solution, i) - load(predicted, i)))

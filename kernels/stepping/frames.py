@@ -31,7 +31,7 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def load_inputs(counters: wp.array(dtype=int), path: wp.array(dtype=vec3), values: wp.array(dtype=vec3)):
-        """This step's row of a path; its last row ever after."""
+        """Load this step's row of a path; its last row ever after."""
         e = index(wp.tid())
         rows = path.shape[0] / values.shape[0]
         values[e] = path[wp.min(counters[1], rows - 1) * values.shape[0] + e]
@@ -40,7 +40,7 @@ def define(variant: Variant) -> SimpleNamespace:
     def scatter_gradient(
         counters: wp.array(dtype=int), values_grad: wp.array(dtype=vec3), path_grad: wp.array(dtype=vec3)
     ):
-        """Adjoint of ``load_inputs``."""
+        """Reverse ``load_inputs``."""
         e = index(wp.tid())
         rows = path_grad.shape[0] / values_grad.shape[0]
         k = wp.min(counters[1], rows - 1) * values_grad.shape[0] + e
@@ -57,8 +57,8 @@ def define(variant: Variant) -> SimpleNamespace:
         values: wp.array(dtype=vec3),
         motion: wp.array(dtype=vec3),
     ):
-        """Where a path is at the time of a stage, on the straight line from the row before to this step's, which is
-        where the step ends; and how far it goes in the step. The first one begins at the start."""
+        """Find where a path is at the time of a stage, on the straight line from the row before to this step's, which
+        is where the step ends; and how far it goes in the step. The first one begins at the start."""
         e = index(wp.tid())
         count = values.shape[0]
         rows = path.shape[0] / count
@@ -78,7 +78,7 @@ def define(variant: Variant) -> SimpleNamespace:
         values_grad: wp.array(dtype=vec3),
         path_grad: wp.array(dtype=vec3),
     ):
-        """Adjoint of ``move_along``."""
+        """Reverse ``move_along``."""
         e = index(wp.tid())
         count = values_grad.shape[0]
         rows = path_grad.shape[0] / count
@@ -135,7 +135,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_solution: wp.array(dtype=scalar),
         euler_next: wp.array(dtype=scalar),
     ):
-        """The state that a step started from, and what the step made of it."""
+        """Restore the state that a step started from, and what the step made of it."""
         i = index(wp.tid())
         k = index(counters[0] * nodes + i)
         next = k + nodes

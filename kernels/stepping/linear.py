@@ -17,7 +17,7 @@ from ..core.variant import Variant
 
 @functools.cache
 def define_reversible(variant: Variant) -> SimpleNamespace:
-    """What the adjoint runs in reverse."""
+    """Define what the adjoint runs in reverse."""
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
 
     @variant.kernel("terms")
@@ -49,7 +49,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         position: wp.array(dtype=vec3),
         solution: wp.array(dtype=vec3),
     ):
-        """The velocity that brings an exact pin to its target within the step, or what is left of it."""
+        """Set the velocity that brings an exact pin to its target within the step, or what is left of it."""
         e = index(wp.tid())
         i = index(pin_node[e])
         solution[i] = (pin_target[e] - position[i]) / remaining[0]
@@ -71,7 +71,8 @@ def define(variant: Variant) -> SimpleNamespace:
         inverse_x: wp.array(dtype=vec3),
         inverse_s: wp.array(dtype=scalar),
     ):
-        """Jacobi: the inverse of the diagonal, and 0 for what does not move, which keeps it out of the iteration."""
+        """Compute Jacobi's preconditioner: the inverse of the diagonal, and 0 for what does not move, which keeps it
+        out of the iteration."""
         i = index(wp.tid())
         one = scalar(1.0)
         if is_free[i] != 0:
@@ -98,7 +99,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """q⁺ = q + h q̇⁺, and whether it is finite."""
+        """Advance to q⁺ = q + h q̇⁺, and whether it is finite."""
         i = index(wp.tid())
         h = step_size[0]
         v = solution[i]
@@ -123,7 +124,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """Δs > 0: crossings keep their order along a yarn."""
+        """Check that Δs > 0: crossings keep their order along a yarn."""
         a, _b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
         if euler[sb] <= euler[sa]:
             fail(status, wp.static(ORDER_LOST), a)

@@ -35,7 +35,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_rhs_grad: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """The right-hand side q̄̇⁺ + h q̄⁺; λ starts at 0. The adjoint of the old velocity starts at 0 as well."""
+        """Compute the right-hand side q̄̇⁺ + h q̄⁺; λ starts at 0. The adjoint of the old velocity starts at 0 as well."""
         i = wp.tid()
         h = step_size[0]
         v = velocity_grad[i] + position_grad[i] * h
@@ -70,7 +70,7 @@ def define(variant: Variant) -> SimpleNamespace:
         upper_sx_grad: wp.array(dtype=vec3),
         upper_ss_grad: wp.array(dtype=scalar),
     ):
-        """Ā = −λ wᵀ on the blocks that are stored; a block above the diagonal stands for its mirror too."""
+        """Compute Ā = −λ wᵀ on the blocks that are stored; a block above the diagonal stands for its mirror too."""
         i = wp.tid()
         w = solution[i]
         minus = -rhs_grad[i]
@@ -106,7 +106,7 @@ def define(variant: Variant) -> SimpleNamespace:
         q_x: wp.array(dtype=vec3),
         solution_grad: wp.array(dtype=vec3),
     ):
-        """Adjoint of an exact pin's velocity: its row of adjoint_rhs − A λ, with q = A λ."""
+        """Add up the adjoint of an exact pin's velocity: its row of adjoint_rhs − A λ, with q = A λ."""
         i = pin_node[wp.tid()]
         solution_grad[i] = solution_grad[i] + adjoint_rhs[i] - q_x[i]
 

@@ -21,7 +21,7 @@ GAMMA = 1.0 - 0.5**0.5
 
 @functools.cache
 def define_reversible(variant: Variant) -> SimpleNamespace:
-    """What the adjoint runs in reverse."""
+    """Define what the adjoint runs in reverse."""
     scalar, vec3 = variant.scalar, variant.vec3
 
     @variant.kernel("ros2")
@@ -33,7 +33,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         euler_first_solution: wp.array(dtype=scalar),
         euler_rhs: wp.array(dtype=scalar),
     ):
-        """η D (v₂ − 2 w₁) of friction."""
+        """Add η D (v₂ − 2 w₁) of friction."""
         i = crossing_node[wp.tid()]
         for direction in range(2):
             s = 2 * i + direction
@@ -64,7 +64,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_start: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """q₂ = q + h w₁, v₂ = q̇ + (w₁ − q̇)/γ and v₂ − 4 w₁ + 2 q̇, whose momentum the second stage has.
+        """Place q₂ = q + h w₁, v₂ = q̇ + (w₁ − q̇)/γ and v₂ − 4 w₁ + 2 q̇, whose momentum the second stage has.
 
         The solve for w₂, if there is to be one, starts from −w₁: from there a step at a constant velocity takes it
         nowhere. It is w₂ of what is held, too, which so arrives where w₁ alone would bring it.
@@ -111,7 +111,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """q⁺ and q̇⁺, and whether they are finite."""
+        """Compute q⁺ and q̇⁺, and whether they are finite."""
         i = wp.tid()
         half = scalar(0.5) * step_size[0]
         rate = scalar(wp.static(0.5 / GAMMA))
@@ -134,7 +134,7 @@ def define(variant: Variant) -> SimpleNamespace:
             fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall_both_stages(
+    def restore_both_stages(
         nodes: int,
         counters: wp.array(dtype=int),
         step_size: wp.array(dtype=scalar),
@@ -148,7 +148,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first_solution: wp.array(dtype=vec3),
         euler_first_solution: wp.array(dtype=scalar),
     ):
-        """w₁ and w₂ of a step that led from q to q⁺ and q̇⁺, which ``restore_frame`` left in the solution.
+        """Compute w₁ and w₂ of a step that led from q to q⁺ and q̇⁺, which ``restore_frame`` left in the solution.
 
         With a = (q⁺ − q)/h, w₁ + w₂ = 2γ (q̇⁺ − a)/(1 − γ) and w₁ = a − ½ (w₁ + w₂).
         """
@@ -189,7 +189,8 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_rhs_grad: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """The right-hand side w̄₂ = ½ h q̄⁺ + q̄̇⁺/(2γ), and w̄₁ = w̄₂ + q̄̇⁺ of the step's end; λ and v̄₂ start at 0."""
+        """Compute the right-hand side w̄₂ = ½ h q̄⁺ + q̄̇⁺/(2γ), and w̄₁ = w̄₂ + q̄̇⁺ of the step's end; λ and v̄₂
+        start at 0."""
         i = wp.tid()
         half = scalar(0.5) * step_size[0]
         rate = scalar(wp.static(0.5 / GAMMA))
@@ -228,7 +229,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_adjoint_rhs: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """``enter_second_stage`` in reverse: the right-hand side w̄₁, with all of it, and v̄.
+        """Reverse ``enter_second_stage``: the right-hand side w̄₁, with all of it, and v̄.
 
         q̄ is what q̄₂ is. w₂ of what is held is −w₁.
         """
@@ -260,7 +261,7 @@ def define(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         enter_second_stage=enter_second_stage,
         leave_second_stage=leave_second_stage,
-        recall_both_stages=recall_both_stages,
+        restore_both_stages=restore_both_stages,
         second_stage_adjoint=second_stage_adjoint,
         first_stage_adjoint=first_stage_adjoint,
     )

@@ -17,13 +17,13 @@ from ..core.variant import Variant
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    """The kernels of ``StageMethod.backward_step``, by name."""
+    """Define the kernels of ``StageMethod.backward_step``, by name."""
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     load = access(variant).load
     module = variant.module("stage_adjoint")
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall_first_stage(
+    def restore_first_stage(
         nodes: int,
         counters: wp.array(dtype=int),
         stage_size: wp.array(dtype=scalar),
@@ -38,7 +38,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first_solution: wp.array(dtype=vec3),
         euler_first_solution: wp.array(dtype=scalar),
     ):
-        """w of the first stage, from q⁺ = q₀ + t w₁ + η w₂; what is held has one velocity in both."""
+        """Compute w of the first stage, from q⁺ = q₀ + t w₁ + η w₂; what is held has one velocity in both."""
         i = index(wp.tid())
         k = (counters[0] + 1) * nodes + i
         w = solution[i]
@@ -52,14 +52,14 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_first_solution[s] = moved / carried_time[0]
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall_carried_stage(
+    def restore_carried_stage(
         carried_rate: wp.array(dtype=scalar),
         velocity: wp.array(dtype=vec3),
         euler_velocity: wp.array(dtype=scalar),
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
     ):
-        """w of a stage that was carried to the step's end, from q̇⁺ = q̇ + k (w − q̇)."""
+        """Compute w of a stage that was carried to the step's end, from q̇⁺ = q̇ + k (w − q̇)."""
         i = index(wp.tid())
         solution[i] = velocity[i] + (solution[i] - velocity[i]) / carried_rate[0]
         if wp.static(sliding):
@@ -77,7 +77,7 @@ def define(variant: Variant) -> SimpleNamespace:
         stage_adjoint: wp.array(dtype=vec3),
         euler_stage_adjoint: wp.array(dtype=scalar),
     ):
-        """Adjoint of q₀ + t w and v₀ + k (w − v₀): w̄ gains, and v̄₀ keeps 1 − k of itself.
+        """Reverse q₀ + t w and v₀ + k (w − v₀): w̄ gains, and v̄₀ keeps 1 − k of itself.
 
         The end of a step, q⁺ = q₀ + η w and q̇⁺ = w, is t = η and k = 1.
         """
@@ -107,7 +107,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_adjoint_rhs: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """ρ = w̄ + (∂r/∂w)ᵀ λ, from what reverse mode has gathered."""
+        """Compute ρ = w̄ + (∂r/∂w)ᵀ λ, from what reverse mode has gathered."""
         i = index(wp.tid())
         r = stage_adjoint[i] + position_grad[i] * stage_size[0] + velocity_grad[i] - increment_grad[i]
         finite = wp.isfinite(r)
@@ -136,7 +136,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first_residual_norm: wp.array(dtype=scalar),
         iterate: wp.array(dtype=int),
     ):
-        """Whether ρ is to fall further, and falls: ‖ρ‖ is in the norm of ``control_newton``."""
+        """Choose whether ρ is to fall further, and falls: ‖ρ‖ is in the norm of ``control_newton``."""
         total = scalar(0.0)
         for i in range(nodes):
             r = load(adjoint_rhs, i)
@@ -157,7 +157,7 @@ def define(variant: Variant) -> SimpleNamespace:
             iterate[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
-    def absorb_stage(
+    def add_stage_adjoint(
         position_grad: wp.array(dtype=vec3),
         euler_grad: wp.array(dtype=scalar),
         increment_grad: wp.array(dtype=vec3),
@@ -167,7 +167,7 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity_grad: wp.array(dtype=vec3),
         base_euler_velocity_grad: wp.array(dtype=scalar),
     ):
-        """The adjoints of q₀ and v₀ gain what came through q = q₀ + η w and v₀ − w."""
+        """Add to the adjoints of q₀ and v₀ what came through q = q₀ + η w and v₀ − w."""
         i = index(wp.tid())
         base_position_grad[i] = base_position_grad[i] + position_grad[i]
         base_velocity_grad[i] = base_velocity_grad[i] + increment_grad[i]
@@ -178,10 +178,10 @@ def define(variant: Variant) -> SimpleNamespace:
                 base_euler_velocity_grad[s] = base_euler_velocity_grad[s] + euler_increment_grad[s]
 
     return SimpleNamespace(
-        recall_first_stage=recall_first_stage,
-        recall_carried_stage=recall_carried_stage,
+        restore_first_stage=restore_first_stage,
+        restore_carried_stage=restore_carried_stage,
         carry_adjoint=carry_adjoint,
         stage_adjoint_residual=stage_adjoint_residual,
         control_adjoint=control_adjoint,
-        absorb_stage=absorb_stage,
+        add_stage_adjoint=add_stage_adjoint,
     )

@@ -35,13 +35,13 @@ SERIES_BELOW = 1.0e-3
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """Warp functions of one bend, shared with the contact force."""
+    """Make the Warp functions of one bend, shared with the contact force."""
     scalar, vec3 = variant.scalar, variant.vec3
     vec2 = wp.types.vector(2, scalar)
 
     @wp.func
     def bend_angle(t1: vec3, t2: vec3) -> vec2:
-        """(θ², θ/sin θ)."""
+        """Compute (θ², θ/sin θ)."""
         cosine = -wp.dot(t1, t2)
         cross = wp.cross(t1, t2)
         z = wp.dot(cross, cross)
@@ -78,7 +78,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         square: scalar,
         angle_over_sine: scalar,
     ) -> vec3:
-        """Force on the end that t1 points to; k = 2k_b/Δs, mine and other (s, s', s'') of the two segments."""
+        """Compute the force on the end that t1 points to; k = 2k_b/Δs, mine and other (s, s', s'') of the two
+        segments."""
         force = (t2 - t1 * wp.dot(t1, t2)) * (-k * other[0] * angle_over_sine * mine[0] * by_length)
         if mine[1] > scalar(0.0):
             force -= t1 * (k * other[0] * scalar(0.5) * (square - scalar(wp.static(FLAT))) * mine[1])
@@ -86,7 +87,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def bend_stiffness(modulus: scalar, radius: scalar) -> scalar:
-        """k_b = B π R² [N m²]."""
+        """Compute k_b = B π R² [N m²]."""
         return modulus * scalar(wp.static(wp.PI)) * radius * radius
 
     return SimpleNamespace(angle=bend_angle, force=bend_force, stiffness=bend_stiffness)
@@ -101,7 +102,7 @@ def define(variant: Variant) -> wp.Kernel:
 
     @wp.func
     def bend_forces(e1: vec3, e2: vec3, k: scalar, unit: scalar):
-        """Forces on the ends that e1 and e2 lead to."""
+        """Compute the forces on the ends that e1 and e2 lead to."""
         l1 = wp.length(e1)
         l2 = wp.length(e2)
         s1 = presence(l1, unit)
@@ -117,7 +118,7 @@ def define(variant: Variant) -> wp.Kernel:
 
     @wp.func
     def in_plane_excess(z: scalar, cosine: scalar, square: scalar, kappa: scalar, angle_over_sine: scalar) -> scalar:
-        """(1 − κ)/sin²θ, → 1/12 at θ = 0."""
+        """Compute (1 − κ)/sin²θ, → 1/12 at θ = 0."""
         if cosine > scalar(0.0) and z < scalar(wp.static(SERIES_BELOW)):
             series = scalar(wp.static(1.0 / 12.0)) + square * (
                 scalar(wp.static(1.0 / 720.0))

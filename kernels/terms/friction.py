@@ -44,7 +44,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def switch(z: scalar) -> scalar:
-        """tanh z to rounding of 1, at half the cost; from 20 on it is 1."""
+        """Compute tanh z to rounding of 1, at half the cost; from 20 on it is 1."""
         return scalar(1.0) - scalar(2.0) / (scalar(1.0) + wp.exp(scalar(2.0) * wp.min(z, scalar(20.0))))
 
     @wp.func
@@ -57,7 +57,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         floor: scalar,
         published_scaling: int,
     ) -> vec2:
-        """(F without its damping, −∂F/∂δ); limit = μF_n."""
+        """Compute (F without its damping, −∂F/∂δ); limit = μF_n."""
         by_force = sharpness
         by_length = sharpness
         if published_scaling == 0:
@@ -153,7 +153,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
         anchor: wp.array(dtype=scalar),
         anchor_next: wp.array(dtype=scalar),
     ):
-        """s̄ after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
+        """Move s̄ to where it is after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
         e = index(wp.tid())
         i = index(crossing_node[e])
         reach = friction[0] * wp.max(contact_load[i], scalar(0.0)) / friction_stiffness[0]
@@ -178,7 +178,8 @@ def define_energy(variant: Variant) -> wp.Kernel:
         contact_load: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        """What friction's springs can give back: the work of their force, at most μF_n, on the way to the anchor."""
+        """Add up what friction's springs can give back: the work of their force, at most μF_n, on the way to the
+        anchor."""
         i = crossing_node[wp.tid()]
         limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
         for direction in range(2):

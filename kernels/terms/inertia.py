@@ -94,7 +94,7 @@ def define_inertia(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        """∂T/∂q."""
+        """Add ∂T/∂q."""
         a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest
@@ -127,7 +127,7 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        """−Ṁ q̇: minus the rate of the momentum M q̇ when q moves and q̇ is held."""
+        """Add −Ṁ q̇: minus the rate of the momentum M q̇ when q moves and q̇ is held."""
         a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest

@@ -36,7 +36,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def barrier(rest: scalar, reach: scalar, stiffness: scalar) -> vec3:
-        """(V, −V', V'') of the barrier; stiffness [N]."""
+        """Compute (V, −V', V'') of the barrier; stiffness [N]."""
         x = rest / reach
         if x >= scalar(1.0):
             return vec3()

@@ -31,7 +31,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def presence(length: scalar, spacing: scalar) -> vec3:
-        """(s, s', s'') of a segment."""
+        """Compute (s, s', s'') of a segment."""
         reach = spacing * scalar(wp.static(REACH))
         if length >= reach:
             return vec3(scalar(1.0), scalar(0.0), scalar(0.0))
@@ -45,7 +45,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def inverse_length(length: scalar, spacing: scalar) -> scalar:
-        """1/l, and a finite number at l = 0, where s takes it away."""
+        """Compute 1/l, and a finite number at l = 0, where s takes it away."""
         return scalar(1.0) / wp.max(length, spacing * scalar(wp.static(1.0e-6 * REACH)))
 
     return SimpleNamespace(smoothstep=smoothstep, presence=presence, inverse_length=inverse_length)

@@ -47,7 +47,8 @@ def functions(variant: Variant) -> SimpleNamespace:
     def shear_lock(
         strain: scalar, sine: scalar, cosine: scalar, threshold: scalar, spacing_by_radius: scalar, second: int
     ) -> vec3:
-        """(lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of φ/2.
+        """Compute (lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of
+        φ/2.
 
         ½ (1 − tanh z) = 1/(1 + exp 2z) =: part, of what is locked; z is from −5 to 14 whatever the angle.
         """
@@ -86,7 +87,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def shear_angle(t1: vec3, t2: vec3) -> vec3:
-        """(φ − π/2, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle."""
+        """Compute (φ − π/2, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle."""
         half = scalar(0.5)
         across = wp.dot(t1, t2)
         if wp.abs(across) < scalar(WIDE):
@@ -101,13 +102,13 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def shear_shut(threshold: scalar, spacing_by_radius: scalar) -> scalar:
-        """The lock at φ = 0."""
+        """Compute the lock at φ = 0."""
         strain = scalar(wp.static(-0.5 * wp.PI))
         return shear_lock(strain, scalar(0.0), scalar(1.0), threshold, spacing_by_radius, 0)[0]
 
     @wp.func
     def shear_unlocked(shear: scalar, radius: scalar, spacing: scalar, load: scalar) -> scalar:
-        """k L of a corner that does not jam [N m]."""
+        """Compute k L of a corner that does not jam [N m]."""
         pressed = scalar(1.0) + wp.max(load, scalar(0.0))
         return shear * scalar(wp.static(wp.PI)) * radius * radius * pressed * spacing
 
@@ -136,7 +137,7 @@ def define(variant: Variant) -> wp.Kernel:
         shut: scalar,
         matrix: int,
     ):
-        """(force on p, force on r, ∇φ at p, ∇φ at r, factor of ∇φ ∇φᵀ, and of t tᵀ of p and of r).
+        """Compute (force on p, force on r, ∇φ at p, ∇φ at r, factor of ∇φ ∇φᵀ, and of t tᵀ of p and of r).
 
         s_p and s_r: (s, s', s'') of the two segments; shut: the lock at φ = 0, where one of them fades.
         """

@@ -21,17 +21,17 @@ from ..core.variant import Term, Variant
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """Warp functions of one segment, shared with the contact force."""
+    """Make the Warp functions of one segment, shared with the contact force."""
     scalar, vec3 = variant.scalar, variant.vec3
 
     @wp.func
     def stretch_stiffness(modulus: scalar, radius: scalar) -> scalar:
-        """kₛ = Y π R² [N]."""
+        """Compute kₛ = Y π R² [N]."""
         return modulus * scalar(wp.static(wp.PI)) * radius * radius
 
     @wp.func
     def stretch_force(d: vec3, rest: scalar, stiffness: scalar) -> vec3:
-        """Force on the segment's first node, kₛ(|w| − 1) t; the second feels the opposite."""
+        """Compute the force on the segment's first node, kₛ(|w| − 1) t; the second feels the opposite."""
         return wp.normalize(d) * (stiffness * (wp.length(d) / rest - scalar(1.0)))
 
     return SimpleNamespace(stiffness=stretch_stiffness, force=stretch_force)

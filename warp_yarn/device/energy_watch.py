@@ -78,7 +78,7 @@ class EnergyWatch:
         self.model.launch("audit", 1)
 
     def _add_energies(self, *, cheap: bool) -> None:
-        """Energy of the cheap terms, or of the others."""
+        """Adds up the energy of the cheap terms, or of the others."""
         for term in self.model.arrays.terms:
             if term.energy is not None and (term.name in CHEAP_ENERGIES) == cheap:
                 energy = self.model.arrays[CHEAP_ENERGIES.get(term.name, "energy")]
@@ -96,7 +96,7 @@ class EnergyWatch:
 
     @property
     def _outer(self) -> list[Term]:
-        """Terms that do work on the cloth and have no energy."""
+        """Finds the terms that do work on the cloth and have no energy."""
         return [term for term in self.model.arrays.terms if term.name in OUTER_FORCES]
 
     def _add_outer_forces(self, target: str) -> None:
@@ -107,7 +107,7 @@ class EnergyWatch:
             self.model.launch_term(term, matrix=0, add_contact_load=0, force=a[target])
 
     def _add_powers(self) -> None:
-        """The power of outer forces and of moving pins at the present state."""
+        """Adds up the power of outer forces and of moving pins at the present state."""
         a = self.model.arrays
         a.zero("power")
         if self._outer:

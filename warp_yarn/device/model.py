@@ -105,7 +105,7 @@ class Model:
         return defaults.newton_tolerance(self.scene, self.precision, step)
 
     def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
-        """The step that kernels make.
+        """Sets the times of the step that kernels make.
 
         Args:
             step: h [s].
@@ -136,7 +136,8 @@ class Model:
             self.copy_array(self.arrays.find(target), self.arrays.find(source))
 
     def copy_array(self, target: wp.array | None, source: wp.array | None) -> None:
-        """By a kernel: wp.copy copies gradients too, and keeps a copy for itself where it is captured on the CPU."""
+        """Copies an array by a kernel: wp.copy copies gradients too, and keeps a copy for itself where it is captured
+        on the CPU."""
         if target is not None:
             kernel = "copy_vectors" if target.dtype == self.arrays.variant.vec3 else "copy_numbers"
             self.launch(kernel, target.shape[0], source=source, target=target)
@@ -192,7 +193,7 @@ class Model:
             self.launch("set_pin_velocity", "pins", **replaced)
 
     def factorize(self) -> None:
-        """The preconditioner of the assembled matrix."""
+        """Computes the preconditioner of the assembled matrix."""
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
@@ -239,7 +240,7 @@ class Model:
         self.energy.begin_step()
 
     def end_step(self, *, by_stages: bool = False) -> None:
-        """What every method ends a step with, its end state in place: checks and moves on, and records the frame.
+        """Checks and moves on, and records the frame: what every method ends a step with, its end state in place.
 
         Args:
             by_stages: whether the method has added up the work of its stages (``energy.add_work``).
@@ -265,7 +266,7 @@ class Model:
             self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
 
     def scatter_input_gradient(self, name: str, stage: int) -> None:
-        """Adjoint of ``load_inputs`` for one of ``PATHS``."""
+        """Reverses ``load_inputs`` for one of ``PATHS``."""
         a = self.arrays
         gradients = {"values_grad": a[name].grad, "path_grad": a[f"{name}_path"].grad}
         if name == "applied_force":

@@ -28,7 +28,7 @@ class LinearlyImplicitEuler:
         self._graphs = GraphCache(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
-        """As of Model.set_times."""
+        """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         self.model.set_times(step, remaining, step)
 
     def advance(self) -> None:
@@ -97,7 +97,7 @@ class LinearlyImplicitEuler:
         self.tape.backward()
 
     def _restore(self) -> None:
-        """The state that the step started from."""
+        """Restores the state that the step started from."""
         self.model.launch("count", 1, by=-1)
         self.model.launch("restore_frame", "nodes")
         self.model.load_inputs()
@@ -112,7 +112,7 @@ class LinearlyImplicitEuler:
             self.anchor_tape.backward()
 
     def _solve(self) -> None:
-        """λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
+        """Solves for λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
         model, a = self.model, self.model.arrays
         model.factorize()
         multiplier = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}

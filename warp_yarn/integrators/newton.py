@@ -37,7 +37,7 @@ class Newton:
             a.put("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE)
 
     def evaluate(self, *, matrix: bool) -> None:
-        """The residual at w, and the matrix if asked for."""
+        """Computes the residual at w, and the matrix if asked for."""
         self.model.launch("enter_stage", "nodes")
         self.assemble(matrix=matrix)
         if matrix:
@@ -94,7 +94,7 @@ class Newton:
         self._control()
 
     def solve_direction(self, stage: int) -> None:
-        """δ, from A δ = r."""
+        """Solves for δ, from A δ = r."""
         a = self.model.arrays
         a.zero("direction", "euler_direction")
         if not len(self.model.scene.pins):

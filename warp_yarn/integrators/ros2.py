@@ -52,7 +52,7 @@ class ROS2(LinearlyImplicitEuler):
         self.set_times(model.step_size, model.step_size)
 
     def set_times(self, step: float, remaining: float) -> None:
-        """As of Model.set_times."""
+        """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         self.model.set_times(step, remaining, GAMMA * step, (GAMMA, 1.0 - GAMMA))
         self.model.arrays.put("stage_size", GAMMA * step)
 
@@ -89,7 +89,7 @@ class ROS2(LinearlyImplicitEuler):
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
-        """As of LinearlyImplicitEuler."""
+        """Makes room for the adjoints within a step, and records what the tape reverses."""
         a = self.model.arrays
         a.make(declarations.CARRIED_ADJOINT)
         a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "increment", "euler_increment", "euler_first_solution")
@@ -106,7 +106,7 @@ class ROS2(LinearlyImplicitEuler):
         model, a = self.model, self.model.arrays
         self._restore()
         model.load_inputs(1)
-        model.launch("recall_both_stages", "nodes")
+        model.launch("restore_both_stages", "nodes")
         model.launch("enter_second_stage", "nodes", start=None, euler_start=None)
         self._assemble_second()
         self._reverse_anchors()

@@ -36,7 +36,7 @@ class StageMethod:
         self._graphs = GraphCache(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
-        """As of Model.set_times."""
+        """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         a, stage = self.model.arrays, self.fraction * step
         self.model.set_times(step, remaining, stage, (self.fraction, self.fraction + self.carried)[: self.stages])
         a.put("newton_tolerance", self.model.newton_tolerance_at(step))
@@ -75,7 +75,7 @@ class StageMethod:
 
     @property
     def _shares(self) -> tuple[float, ...]:
-        """Of each stage's slope in what a step makes."""
+        """Gives the share of each stage's slope in what a step makes."""
         return (1.0,) if self.stages == 1 else (self.carried, self.fraction)
 
     def estimate_errors(self) -> None:
@@ -88,16 +88,16 @@ class StageMethod:
 
     @property
     def is_carried(self) -> bool:
-        """Whether what the only stage leads to is carried to the step's end."""
+        """Says whether what the only stage leads to is carried to the step's end."""
         return self.stages == 1 and self.carried > 0.0
 
     @property
     def iterations(self) -> int:
-        """Newton iterations of the last step."""
+        """Counts Newton iterations of the last step."""
         return int(self.model.arrays["newton_iterations"].numpy()[0])
 
     def _begin(self) -> None:
-        """The stage starts from the present state, at the present velocity."""
+        """Starts from the present state, at the present velocity."""
         model = self.model
         model.begin_step()
         model.energy.begin_work()
@@ -117,10 +117,10 @@ class StageMethod:
         )
 
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
-        """As of LinearlyImplicitEuler."""
+        """Makes room for the adjoints within a step, and records what the tape reverses."""
         self._adjoint = StageAdjoint(self, before, after)
         self.tape = self._adjoint.tape
 
     def backward_step(self) -> None:
-        """As of LinearlyImplicitEuler."""
+        """Goes back over the step that ends at the present frame."""
         self._adjoint.backward_step()

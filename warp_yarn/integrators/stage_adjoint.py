@@ -58,7 +58,7 @@ class StageAdjoint:
         self._graphs.run(part.__name__, part)
 
     def backward_step(self) -> None:
-        """As of LinearlyImplicitEuler; (−∂r/∂w)ᵀ λ = w̄ is solved to the linear tolerance, with the exact derivative."""
+        """Goes back over the step that ends at the present frame."""
         self._run(self._restore)
         self._run(self._enter_last)
         self._solve()
@@ -68,7 +68,7 @@ class StageAdjoint:
         self._run(self._finish)
 
     def _restore(self) -> None:
-        """The step that ends at the present frame; the running adjoints go to the base."""
+        """Restores the step that ends at the present frame; the running adjoints go to the base."""
         model, a = self.model, self.model.arrays
         before, _ = self._around
         before()
@@ -77,16 +77,16 @@ class StageAdjoint:
         model.load_inputs(self.method.stages - 1)
         self.method.set_base()
         if self.method.is_carried:
-            model.launch("recall_carried_stage", "nodes")
+            model.launch("restore_carried_stage", "nodes")
         if self.method.stages == 2:
-            model.launch("recall_first_stage", "nodes")
+            model.launch("restore_first_stage", "nodes")
             first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
             model.launch("next_base", "nodes", start=None, **first)
         model.copy(**{f"base_{name}_grad": f"{name}_grad" for name in STATE})
         a.zero_grad("solution")
 
     def _enter_last(self) -> None:
-        """The stage that ended the step, and w̄ of the step's end."""
+        """Enters the stage that ended the step, and w̄ of the step's end."""
         model, a = self.model, self.model.arrays
         self._enter()
         if a["anchor"] is not None:
@@ -100,7 +100,7 @@ class StageAdjoint:
             model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
 
     def _enter_first(self) -> None:
-        """The stage before it, and w̄ of what it carried to the next."""
+        """Enters the stage before it, and w̄ of what it carried to the next."""
         model, a = self.model, self.model.arrays
         _, after = self._around
         after(1)
@@ -128,7 +128,7 @@ class StageAdjoint:
             # what is held has no λ: its row of ρ is the adjoint of the velocity that holds it
             a.zero("q_x")
             model.launch("hard_pin_adjoint", "pins")
-        model.launch("absorb_stage", "nodes")
+        model.launch("add_stage_adjoint", "nodes")
 
     def _finish(self) -> None:
         if self.model.has_hard_pins:

@@ -40,7 +40,7 @@ class StageSolve:
         self._graphs.run(part.__name__, part)
 
     def solve(self) -> None:
-        """λ of (−∂r/∂w)ᵀ λ = ρ₀: reverse mode with all of it, and its share of the adjoints of q₀ and v₀."""
+        """Solves for λ of (−∂r/∂w)ᵀ λ = ρ₀; reverse mode has then run with all of it."""
         a = self.model.arrays
         self._run(self._descend)
         size, first = (float(a[name].numpy()[0]) for name in ("residual_norm", "first_residual_norm"))
@@ -48,7 +48,7 @@ class StageSolve:
             self._minimize(size, first)
 
     def _descend(self) -> None:
-        """Parts of λ, each A⁻¹ ρ of what the parts before it left, as long as they more than halve ρ.
+        """Adds up parts of λ, each A⁻¹ ρ of what the parts before it left, as long as they more than halve ρ.
 
         Reverse mode adds to what it has added for the parts before: in the end it has run for all of λ.
         """
@@ -104,7 +104,8 @@ class StageSolve:
         self._run(self._gather)
 
     def _vector(self, *names: str, gradient: bool = False) -> np.ndarray:
-        """An array of the positions and its companion of (u, v), as one vector; named by the first, or by both."""
+        """Joins an array of the positions and its companion of (u, v), as one vector; named by the first, or by
+        both."""
         total = []
         for name in names if len(names) == 2 else (names[0], f"euler_{names[0]}"):
             array = self.model.arrays[name]
@@ -123,7 +124,8 @@ class StageSolve:
                 at += count
 
     def _arrays_added_to(self) -> tuple[str, ...]:
-        """Arrays whose gradients reverse mode adds to: the stage's own, friction's anchors and the parameters."""
+        """Finds the arrays whose gradients reverse mode adds to: the stage's own, friction's anchors and the
+        parameters."""
         between = {*BETWEEN, "rhs", "euler_rhs"}
         arrays = (array for launch in self.tape.launches for array in arrays_of(launch))
         pointers = {array.ptr for array in arrays if array.grad is not None}
@@ -135,7 +137,7 @@ class StageSolve:
         )
 
     def _gather(self) -> None:
-        """ρ = w̄ + (∂r/∂w)ᵀ λ, of what reverse mode has gathered."""
+        """Gathers ρ = w̄ + (∂r/∂w)ᵀ λ, of what reverse mode has gathered."""
         self.model.launch("stage_adjoint_residual", "nodes")
 
     def _solve_part(self) -> None:
@@ -145,7 +147,7 @@ class StageSolve:
         self.model.solve(tolerance=a["inner_tolerance"], rhs=a["adjoint_rhs"], euler_rhs=a["euler_adjoint_rhs"], **part)
 
     def _product(self) -> None:
-        """(∂r/∂w)ᵀ of the part in the gradient of the right-hand side."""
+        """Computes (∂r/∂w)ᵀ of the part in the gradient of the right-hand side."""
         a = self.model.arrays
         a.zero_grad(*MOVED)
         self._reverse()
