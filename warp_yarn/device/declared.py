@@ -131,6 +131,13 @@ class DeclaredArrays(dict[str, Any]):
             # as zero_, no part of a tape
             wp.launch(clear, dim=array.shape[0], inputs=[array], device=self.device, record_tape=False)
 
+    def copy_into(self, target: wp.array | None, source: wp.array | None) -> None:
+        """Copy an array by a kernel: wp.copy copies gradients too, and keeps a copy for itself where it is captured on
+        the CPU."""
+        if target is not None:
+            kernel = "copy_vectors" if target.dtype == self.variant.vec3 else "copy_numbers"
+            self.launch(build(self.variant)[kernel], target.shape[0], source=source, target=target)
+
     # -- launches ----------------------------------------------------------------------------------------------------
 
     def launch(self, kernel: wp.Kernel, elements: str | int, **replaced: Any) -> None:

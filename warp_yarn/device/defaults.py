@@ -56,6 +56,11 @@ def tolerance(precision: str, *, exact: bool) -> float:
     return EXACT if exact else TOLERANCES[precision]
 
 
+def max_iterations(scene: Scene) -> int:
+    """Choose the most iterations of linear solves: as many as there are degrees of freedom, and 1000 at least."""
+    return max(1000, scene.cloth.nodes * (5 if scene.sliding else 3))
+
+
 def newton_tolerance(scene: Scene, precision: str, step: float) -> float:
     """Choose the tolerance of implicit stages: what follows the error of steps of this size [s]."""
     rate = _stretch_rate(scene)

@@ -68,7 +68,7 @@ class EnergyWatch:
 
     def _audit(self) -> None:
         if "pins move" in self.model.arrays.conditions:
-            self.model.load_inputs(AT_START)
+            self.model.inputs.load(AT_START)
         self.model.add_contact_load()
         self.model.arrays.zero("energy", "elastic_energy", "height_energy")
         self._add_energies(cheap=True)

@@ -19,6 +19,7 @@ from . import defaults
 from .arrays import Arrays
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
+from .inputs import Inputs
 from .threads import Threads
 
 MATRIX = (
@@ -27,8 +28,6 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-PATHS = ("pin_target", "applied_force")
-"""Inputs that may change from step to step."""
 SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
 """What differs from one linear solve to another."""
 
@@ -43,6 +42,7 @@ class Model:
     Attributes:
         arrays: by the names that kernels use.
         kernels: by name.
+        inputs: those that change from step to step.
         energy: the watch over it.
         threads: processor cores that share a linear solve.
         has_hard_pins: whether pins are exact.
@@ -76,22 +76,18 @@ class Model:
         self.tolerance = number("tolerance", tolerance, above=0.0)
         if newton_tolerance is None and exact:
             newton_tolerance = defaults.EXACT
-        self._newton_tolerance = None
-        if newton_tolerance is not None:
-            self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0)
-        degrees = scene.cloth.nodes * (5 if scene.sliding else 3)
-        most = max(1000, degrees) if max_iterations is None else max_iterations
-        self.max_iterations = whole("max_iterations", most, least=1)
-        try:
-            self.device = wp.get_device(device)
-        except Exception as error:
-            names = ", ".join(str(d) for d in wp.get_devices())
-            raise InputError(f"device = {device!r}, must be one of {names}") from error
+        given = newton_tolerance is not None
+        self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0) if given else None
+        if max_iterations is None:
+            max_iterations = defaults.max_iterations(scene)
+        self.max_iterations = whole("max_iterations", max_iterations, least=1)
+        self.device = _checked_device(device)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant)
         self.arrays = Arrays(scene, variant, self.device)
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
+        self.inputs = Inputs(self)
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
@@ -133,14 +129,7 @@ class Model:
     def copy(self, **targets: str) -> None:
         """Copies arrays, target="source", those that the scene has; ``x_grad`` is the gradient of ``x``."""
         for target, source in targets.items():
-            self.copy_array(self.arrays.find(target), self.arrays.find(source))
-
-    def copy_array(self, target: wp.array | None, source: wp.array | None) -> None:
-        """Copies an array by a kernel: wp.copy copies gradients too, and keeps a copy for itself where it is captured
-        on the CPU."""
-        if target is not None:
-            kernel = "copy_vectors" if target.dtype == self.arrays.variant.vec3 else "copy_numbers"
-            self.launch(kernel, target.shape[0], source=source, target=target)
+            self.arrays.copy_into(self.arrays.find(target), self.arrays.find(source))
 
     def assemble(
         self,
@@ -198,18 +187,7 @@ class Model:
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
         if self.preconditioner == "multilevel":
-            self._factorize_levels()
-
-    def _factorize_levels(self) -> None:
-        starts = self.arrays.level_start
-        for first, end in itertools.pairwise(starts):
-            self.launch("coarsen", BLOCKS * (end - first), first=first)
-        for direction, name in enumerate(("warp_lines", "weft_lines")):
-            self.launch("factorize_lines", name, along=direction)
-            self.launch("factorize_coarse_lines", f"coarse_{name}", along=direction)
-        if len(starts) > 1:
-            first, end = starts[-2:]
-            self.launch("factorize_coarsest", 1, first=first, count=end - first)
+            _factorize_levels(self)
 
     def solve(self, **replaced: Any) -> None:
         """Launch the conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
@@ -249,27 +227,30 @@ class Model:
             self.launch("check_order", "segments")
         if "pins move" in self.arrays.conditions:
             # pins are looked at where they are now, not where they were at the last stage's time
-            self.load_inputs(AT_END)
+            self.inputs.load(AT_END)
         self.energy.end_step(by_stages=by_stages)
         self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
 
-    def load_inputs(self, stage: int = 0) -> None:
-        """Puts pins and applied forces of a stage of this step in place, where they change."""
-        a = self.arrays
-        if "forces change" in a.conditions:
-            path, values = a["applied_force_path"], a["applied_force"]
-            self.launch("load_inputs", len(values), path=path, values=values)
-        if "pins move" in a.conditions:
-            arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
-            self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
 
-    def scatter_input_gradient(self, name: str, stage: int) -> None:
-        """Reverses ``load_inputs`` for one of ``PATHS``."""
-        a = self.arrays
-        gradients = {"values_grad": a[name].grad, "path_grad": a[f"{name}_path"].grad}
-        if name == "applied_force":
-            self.launch("scatter_gradient", len(a[name]), **gradients)
-        else:
-            self.launch("scatter_gradient_along", "pins", stage=stage, **gradients)
+def _checked_device(device: Any) -> Any:
+    """Finds a device of Warp."""
+    try:
+        return wp.get_device(device)
+    except Exception as error:
+        names = ", ".join(str(d) for d in wp.get_devices())
+        raise InputError(f"device = {device!r}, must be one of {names}") from error
+
+
+def _factorize_levels(model: Model) -> None:
+    """Factorizes lines and coarse levels, from the cloth up."""
+    starts = model.arrays.level_start
+    for first, end in itertools.pairwise(starts):
+        model.launch("coarsen", BLOCKS * (end - first), first=first)
+    for direction, name in enumerate(("warp_lines", "weft_lines")):
+        model.launch("factorize_lines", name, along=direction)
+        model.launch("factorize_coarse_lines", f"coarse_{name}", along=direction)
+    if len(starts) > 1:
+        first, end = starts[-2:]
+        model.launch("factorize_coarsest", 1, first=first, count=end - first)

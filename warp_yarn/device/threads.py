@@ -60,10 +60,10 @@ class Threads:
         """Launch the first thread's part of a solve; the helpers were launched before, with arrays of their own."""
         model, own = self.model, self._own(arrays)
         for name, array in arrays.items():
-            model.copy_array(own[name], array)
+            model.arrays.copy_into(own[name], array)
         model.launch_solve(0, own)
         for name in ("solution", "euler_solution"):
-            model.copy_array(arrays[name], own[name])
+            model.arrays.copy_into(arrays[name], own[name])
 
     def _own(self, names: Any) -> dict[str, Any]:
         return {name: self.model.arrays[f"helper_{name}"] for name in names}

@@ -12,7 +12,7 @@ import numpy as np
 from ..device import declarations
 from ..device.arrays import STATE_TYPES
 from ..device.declared import arrays_of
-from ..device.model import PATHS
+from ..device.inputs import PATHS
 from ..errors import GradientError, InputError
 from ..kernels.core.status import NOT_FINITE
 from ..simulation.simulator import Simulator
@@ -47,7 +47,7 @@ class Adjoint:
     def _scatter_gradient(self, stage: int) -> None:
         """Hands what a stage gave to inputs that change from step to step to the rows of their paths."""
         for name in self.moving:
-            self.simulator.model.scatter_input_gradient(name, stage)
+            self.simulator.model.inputs.scatter_gradient(name, stage)
 
     def release(self) -> None:
         """Gives the gradients of parameters up, before another one asks for other parameters."""

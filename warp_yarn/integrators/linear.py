@@ -38,7 +38,7 @@ class LinearlyImplicitEuler:
     def _step(self) -> None:
         model = self.model
         model.begin_step()
-        model.load_inputs()
+        model.inputs.load()
         model.assemble()
         # The last velocity is the start: a step changes it little.
         model.copy(solution="velocity", euler_solution="euler_velocity")
@@ -100,7 +100,7 @@ class LinearlyImplicitEuler:
         """Restores the state that the step started from."""
         self.model.launch("count", 1, by=-1)
         self.model.launch("restore_frame", "nodes")
-        self.model.load_inputs()
+        self.model.inputs.load()
 
     def _reverse_anchors(self) -> None:
         """Takes friction's anchors back, first of all that the adjoints of an assembly gather."""

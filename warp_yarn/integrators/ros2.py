@@ -60,7 +60,7 @@ class ROS2(LinearlyImplicitEuler):
         model, a = self.model, self.model.arrays
         first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
         model.begin_step()
-        model.load_inputs()
+        model.inputs.load()
         self._assemble_first()
         model.copy(first_solution="velocity", euler_first_solution="euler_velocity")
         model.set_pin_velocity(solution=a["first_solution"])
@@ -69,7 +69,7 @@ class ROS2(LinearlyImplicitEuler):
         model.launch("enter_second_stage", "nodes", start=a["solution"], euler_start=a["euler_solution"])
         if model.scene.sliding:
             model.launch("check_order", "segments")
-        model.load_inputs(1)
+        model.inputs.load(1)
         self._assemble_second()
         model.factorize()
         model.solve()
@@ -105,7 +105,7 @@ class ROS2(LinearlyImplicitEuler):
     def _reverse(self) -> None:
         model, a = self.model, self.model.arrays
         self._restore()
-        model.load_inputs(1)
+        model.inputs.load(1)
         model.launch("restore_both_stages", "nodes")
         model.launch("enter_second_stage", "nodes", start=None, euler_start=None)
         self._assemble_second()
@@ -118,7 +118,7 @@ class ROS2(LinearlyImplicitEuler):
         after(1)
 
         model.launch("restore_frame", "nodes")
-        model.load_inputs()
+        model.inputs.load()
         self._assemble_first()
         a.zero_grad(*BETWEEN)
         model.launch("first_stage_adjoint", "nodes")

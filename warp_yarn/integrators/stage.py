@@ -54,7 +54,7 @@ class StageMethod:
         self._begin()
         for stage in range(self.stages):
             if stage:
-                model.load_inputs(stage)
+                model.inputs.load(stage)
                 model.launch("ask_for_matrix", "segments")
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
                 if estimates:
@@ -101,7 +101,7 @@ class StageMethod:
         model = self.model
         model.begin_step()
         model.energy.begin_work()
-        model.load_inputs()
+        model.inputs.load()
         model.arrays.zero("newton_iterations", "node_mass")
         model.launch("lump_mass", "segments")
         model.copy(solution="velocity", euler_solution="euler_velocity")

@@ -74,7 +74,7 @@ class StageAdjoint:
         before()
         model.launch("count", 1, by=-1)
         model.launch("restore_frame", "nodes")
-        model.load_inputs(self.method.stages - 1)
+        model.inputs.load(self.method.stages - 1)
         self.method.set_base()
         if self.method.is_carried:
             model.launch("restore_carried_stage", "nodes")
@@ -104,7 +104,7 @@ class StageAdjoint:
         model, a = self.model, self.model.arrays
         _, after = self._around
         after(1)
-        model.load_inputs()
+        model.inputs.load()
         model.launch("restore_frame", "nodes")
         self.method.set_base()
         self.model.copy(solution="first_solution", euler_solution="euler_first_solution")

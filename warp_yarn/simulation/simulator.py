@@ -678,7 +678,7 @@ class _Visit:
         simulator.arrays.put("counters", 0, self.row)
         # before the first step, pins are where they start
         simulator.arrays.put("stage_times", *[float(self.ahead or simulator._steps_done > 0)] * 4)
-        simulator.model.load_inputs()
+        simulator.model.inputs.load()
         if self.visited is not None:
             simulator._upload(self.visited)
 
