@@ -11,9 +11,9 @@ from ..core.status import ORDER_LOST, fail
 from ..core.structs import structs
 from ..core.variant import Variant
 
-NEAREST = 0.1
+LEAST_LEFT = 0.1
 """Part of a Δs that a step of the iteration leaves of it at least."""
-EXTRAPOLATED = 0.5
+LEAST_EXTRAPOLATED = 0.5
 """Part of a Δs that must be left where a first stage is extrapolated to the second one's base, else the step is split:
 where crossings fly at each other, the second stage would begin inside the barrier, and gain several times the energy
 of the start."""
@@ -42,7 +42,7 @@ def define(variant: Variant) -> SimpleNamespace:
         rest = base_euler[sb] - base_euler[sa]
         if rest + (euler_solution[sb] - euler_solution[sa]) * stage_size[0] <= scalar(0.0):
             order_would_be_lost[0] = 1
-        if rest < scalar(EXTRAPOLATED) * (euler[sb] - euler[sa]):
+        if rest < scalar(LEAST_EXTRAPOLATED) * (euler[sb] - euler[sa]):
             fail(status, wp.static(ORDER_LOST), a)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -103,7 +103,7 @@ def define(variant: Variant) -> SimpleNamespace:
         sa, sb = coordinates(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         loss = (euler_direction[sa] - euler_direction[sb]) * stage_size[0]
-        allowed = rest * scalar(wp.static(1.0 - NEAREST))
+        allowed = rest * scalar(wp.static(1.0 - LEAST_LEFT))
         if loss > allowed and rest > scalar(0.0):
             wp.atomic_min(step_length, 0, allowed / loss)
 

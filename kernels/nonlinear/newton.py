@@ -14,27 +14,27 @@ from ..core.status import NOT_FINITE, STALLED
 from ..core.structs import structs
 from ..core.variant import Variant
 
-MOST_TRIES = 200
+MOST_EVALUATIONS = 200
 """Evaluations in a stage. Newton's iteration takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so
 that violent sliding brings them to dozens."""
-SHORTEST_STEP = 2.0**-24
+SHORTEST_STEP_LENGTH = 2.0**-24
 """Of the line search: where crossings nearly touch, or l and Δs shrink together, which costs next to no energy, it must
 be short indeed."""
-TURNED = 0.9
+OVERSHOOT = 0.9
 """Part of the slope that a step of the iteration may turn to with the other sign (``integrators/stage.py``)."""
-SLOW = 0.3
+SLOW_DECREASE = 0.3
 """Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
 matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
-CAUTION = 4.0
+CONTRACTION_SAFETY = 4.0
 """What a step of the iteration leaves is taken to be so many times what the contraction before it says."""
-TRUSTED = 1e-3
+LEAST_CONTRACTION = 1e-3
 """The least contraction that is believed: a cloth that moves as one is solved at once, and what comes next is not."""
-TURNING = 0.03
+REBUILDING_TURN = 0.03
 """Angle by which a yarn turns in a step, above which its second stage has a matrix of its own: below 0.025, one
 iteration did with that of the first stage, above 0.045, two to seven, and one or two with its own (17 × 17)."""
-ROUNDING = 10.0
+ROUNDING_MARGIN = 10.0
 """Times the rounding of positions that a residual may end with where no step takes more of it away."""
-COARSENESS = {wp.float64: 1e-15, wp.float32: 5e-7}
+POSITION_ROUNDING = {wp.float64: 1e-15, wp.float32: 5e-7}
 """A few units in the last place."""
 
 
@@ -75,16 +75,16 @@ def define(variant: Variant) -> SimpleNamespace:
         energy. What it leaves is taken from the contraction.
         """
         norm = wp.sqrt(wp.max(control.directional_derivative[0], scalar(0.0)))
-        left = scalar(CAUTION)
+        left = scalar(CONTRACTION_SAFETY)
         if control.steps[0] > 0:
-            control.contraction[0] = wp.max(norm / control.last_norm[0], scalar(TRUSTED))
+            control.contraction[0] = wp.max(norm / control.last_norm[0], scalar(LEAST_CONTRACTION))
             left *= control.contraction[0]
         elif stage == 0:
             # not known of a time step's first
             left = scalar(1.0)
         else:
             # that of the stage before, whose matrix this one begins with
-            left *= control.contraction[0] * scalar(CAUTION)
+            left *= control.contraction[0] * scalar(CONTRACTION_SAFETY)
         # not of the first δ, of which the line search may take little
         control.change[0] = wp.sqrt(control.kinetic[0])
         if stage == 0:
@@ -176,20 +176,20 @@ def define(variant: Variant) -> SimpleNamespace:
             nodes, is_free, inverse_x, inverse_s, rhs, euler_rhs, direction, euler_direction, position, euler
         )
         # velocities that positions are too coarse to tell from 0
-        rounding *= scalar(wp.static(COARSENESS[scalar])) / stage_size[0]
+        rounding *= scalar(wp.static(POSITION_ROUNDING[scalar])) / stage_size[0]
         before = control.residual_norm[0]
         first = control.evaluations[0] == 0
         control.evaluations[0] = control.evaluations[0] + 1
         control.iterate[0] = 1
         control.new_direction[0] = 1
         control.rebuild_matrix[0] = 0
-        stalled = control.evaluations[0] > wp.static(MOST_TRIES)
+        stalled = control.evaluations[0] > wp.static(MOST_EVALUATIONS)
         ordered = bool(True)
         if wp.static(sliding):
             ordered = control.shortest[0] > scalar(0.0)
             control.shortest[0] = scalar(wp.static(1.0e30))
-        if first or (ordered and (now < before or turned > scalar(-TURNED) * control.directional_derivative[0])):
-            if not first and now > scalar(SLOW) * before:
+        if first or (ordered and (now < before or turned > scalar(-OVERSHOOT) * control.directional_derivative[0])):
+            if not first and now > scalar(SLOW_DECREASE) * before:
                 # a step that hardly helps: the matrix is of another state
                 control.rebuild_matrix[0] = 1
             if now == scalar(0.0) or (not first and now > scalar(0.5) * before and now <= rounding):
@@ -204,7 +204,7 @@ def define(variant: Variant) -> SimpleNamespace:
             control.new_direction[0] = 0
             control.rebuild_matrix[0] = 1
             control.step_length[0] = control.step_length[0] * scalar(0.5)
-            stalled = stalled or control.step_length[0] < scalar(wp.static(SHORTEST_STEP))
+            stalled = stalled or control.step_length[0] < scalar(wp.static(SHORTEST_STEP_LENGTH))
         if status[0] != 0:
             control.iterate[0] = 0
         elif not wp.isfinite(before):
@@ -215,7 +215,7 @@ def define(variant: Variant) -> SimpleNamespace:
             control.iterate[0] = 0
             # what rounding leaves cannot be taken away; nor is there a need to where the last step was small enough
             small = not first and control.last_norm[0] <= control.newton_tolerance[0] * control.change[0]
-            if not (small or before <= rounding * scalar(wp.static(ROUNDING))):
+            if not (small or before <= rounding * scalar(wp.static(ROUNDING_MARGIN))):
                 status[0] = wp.static(STALLED)
                 status[1] = -1
 
@@ -230,7 +230,7 @@ def define(variant: Variant) -> SimpleNamespace:
         """Asks for a new matrix where a yarn turns in the step."""
         a, b, _sa, _sb, _yarn, _direction = ends(segments, index(wp.tid()))
         moved = wp.length(solution[b] - solution[a]) * step_size[0]
-        if moved > scalar(wp.static(TURNING)) * spacing[0]:
+        if moved > scalar(wp.static(REBUILDING_TURN)) * spacing[0]:
             rebuild_matrix[0] = 1
 
     return SimpleNamespace(

@@ -26,7 +26,7 @@ FADING = 0.05
 """Sine of the angle between warp and weft under which a crossing's normal fades: 3 degrees, far beyond any lock."""
 
 MOST_PASSES = 4
-TURNED = {wp.float64: 1e-12, wp.float32: 1e-5}
+CONVERGED_TURN = {wp.float64: 1e-12, wp.float32: 1e-5}
 """Square of the sine by which a pass of the iteration may still turn a normal, its own error being the cube of that."""
 
 
@@ -74,7 +74,7 @@ def functions(variant: Variant) -> SimpleNamespace:
             n = m * last
             square = wp.dot(n, n)
             both, along = square * last_square, wp.dot(n, last)
-            if both - along * along < scalar(wp.static(TURNED[scalar])) * both:
+            if both - along * along < scalar(wp.static(CONVERGED_TURN[scalar])) * both:
                 if wp.trace(m) > scalar(0.0) and shift < scalar(wp.static(1.0 / 3.0)):
                     return wp.normalize(n)
                 return vec3()

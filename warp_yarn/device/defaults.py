@@ -17,7 +17,7 @@ PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
 NEWTON_TOLERANCE = 2e-2
-SLOW = 1e3
+SLOW_MOTION = 1e3
 """k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error
 smaller, as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
 TIGHT = {"double": 1e-2, "single": 1e-1}
@@ -47,7 +47,7 @@ def preconditioner(scene: Scene, step: float) -> str:
     cloth = scene.cloth
     stretch = step * cloth.stretch_stiffness.max() / cloth.spacing
     holds = "friction" in scene.terms and cloth.friction_damping > HOLDING * stretch
-    stiffness = (_stretch_rate(scene).max() * step) ** 2
+    stiffness = (stretch_rate(scene).max() * step) ** 2
     return "multilevel" if stiffness > (STIFF if holds or not scene.sliding else STIFF_SLIDING) else "incomplete"
 
 
@@ -63,16 +63,16 @@ def max_iterations(scene: Scene) -> int:
 
 def newton_tolerance(scene: Scene, precision: str, step: float) -> float:
     """Choose the tolerance of implicit stages: what follows the error of steps of this size [s]."""
-    rate = _stretch_rate(scene)
+    rate = stretch_rate(scene)
     fastest = float(rate.max())
-    slow = min(1.0, math.sqrt(SLOW) / (fastest * step)) if fastest > 0.0 else 1.0
+    slow = min(1.0, math.sqrt(SLOW_MOTION) / (fastest * step)) if fastest > 0.0 else 1.0
     # steps of fewer seconds resolve the yarns' stretching
     resolving = math.inf if precision == "single" or not rate.any() else rate[rate > 0.0].min() / RESOLVED
     resolved = min(1.0, step * resolving) ** 2
     return max(EXACT, NEWTON_TOLERANCE * max(TIGHT[precision], slow) * resolved)
 
 
-def _stretch_rate(scene: Scene) -> np.ndarray:
+def stretch_rate(scene: Scene) -> np.ndarray:
     """Compute √(k_s/(m L)) of every material, m the mass of a segment [1/s]."""
     cloth = scene.cloth
     return np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns]) / cloth.spacing
