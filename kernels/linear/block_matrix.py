@@ -50,7 +50,7 @@ UPPER = """
     };
 """
 """C++ that adds up row i of U (x, s), slot by slot."""
-_GATHER = (
+_UPPER_PRODUCT = (
     UPPER
     + """
     for (int slot = blocks.stencil - 1; slot >= 0; --slot) {
@@ -72,7 +72,7 @@ _GATHER = (
     return y;
 """
 )
-_SPREAD = """
+_SUBTRACT_TRANSPOSED = """
     auto take = [&](int slot, int direction, SCALAR along) {
         const int j = blocks.neighbour.data[blocks.stencil * i + slot];
         if (j < 0)
@@ -116,8 +116,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Compute m x. By rows, as they lie in memory: Warp's own product goes by columns."""
         return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
 
-    @wp.func_native(memory.rows(variant, _GATHER))
-    def gather_together(
+    @wp.func_native(memory.rows(variant, _UPPER_PRODUCT))
+    def upper_product_together(
         i: int,
         blocks: BlockMatrix,
         x: wp.array(dtype=vec3),
@@ -125,18 +125,18 @@ def functions(variant: Variant) -> SimpleNamespace:
     ) -> vec5: ...
 
     @wp.func
-    def gather(
+    def upper_product(
         i: int,
         blocks: BlockMatrix,
         x: wp.array(dtype=vec3),
         s: wp.array(dtype=scalar),
     ):
         """Add up row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
-        y = gather_together(i, blocks, x, s)
+        y = upper_product_together(i, blocks, x, s)
         return vec3(y[0], y[1], y[2]), y[3], y[4]
 
-    @wp.func_native(memory.rows(variant, _SPREAD))
-    def spread(
+    @wp.func_native(memory.rows(variant, _SUBTRACT_TRANSPOSED))
+    def subtract_transposed(
         i: int,
         blocks: BlockMatrix,
         x: vec3,
@@ -163,7 +163,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         v = scalar(0.0)
         for i in range(nodes):
             x = load(p_x, i)
-            y, y_u, y_v = gather(i, blocks, p_x, p_s)
+            y, y_u, y_v = upper_product(i, blocks, p_x, p_s)
             y += times(load(blocks.diagonal_xx, i), x)
             if wp.static(sliding):
                 u = load(p_s, 2 * i)
@@ -178,7 +178,7 @@ def functions(variant: Variant) -> SimpleNamespace:
                     load(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + load(blocks.diagonal_ss, 2 * i + 1) * v,
                 )
             store(q_x, i, load(q_x, i) + y)
-            spread(i, blocks, -x, -u, -v, q_x, q_s)
+            subtract_transposed(i, blocks, -x, -u, -v, q_x, q_s)
 
     @wp.func
     def write_report(count: int, rz: scalar, size: scalar, limit: scalar, report: SolveReport) -> bool:
@@ -190,7 +190,13 @@ def functions(variant: Variant) -> SimpleNamespace:
         report.status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
         return True
 
-    return SimpleNamespace(times=times, gather=gather, spread=spread, multiply=multiply, write_report=write_report)
+    return SimpleNamespace(
+        times=times,
+        upper_product=upper_product,
+        subtract_transposed=subtract_transposed,
+        multiply=multiply,
+        write_report=write_report,
+    )
 
 
 @functools.cache

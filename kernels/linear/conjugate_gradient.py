@@ -33,8 +33,9 @@ def define(variant: Variant) -> SimpleNamespace:
         variant.scalar, variant.vec3, variant.sym33, variant.sliding,
     )  # fmt: skip
     load, store = memory.functions(variant).load, memory.functions(variant).store
-    times, gather, spread = (getattr(block_matrix.functions(variant), name) for name in ("times", "gather", "spread"))
-    write_report = block_matrix.functions(variant).write_report
+    shared = block_matrix.functions(variant)
+    times, upper_product, subtract_transposed = shared.times, shared.upper_product, shared.subtract_transposed
+    write_report = shared.write_report
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
     SolveReport = structs(variant).SolveReport
     symmetric, product = (
@@ -73,7 +74,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 if threads > 1:
                     keep_pace(signals, thread, thread + 1, thread - 1, threads, width - 1 - column, width, swept + row)
                 i = begin + column
-                w, w_u, w_v = gather(i, blocks, work.t_x, work.t_s)
+                w, w_u, w_v = upper_product(i, blocks, work.t_x, work.t_s)
                 p = load(work.r_x, i) + load(work.p_x, i) * beta
                 t = product(load(inverse_pivot, i), p - w)
                 q = w + product(symmetric(load(blocks.diagonal_xx, i)), t)
@@ -153,7 +154,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     store(work.r_s, 2 * i + 1, r_v)
                     rz += r_u * inverse_u * r_u + r_v * inverse_v * r_v
                 y = product(inverse, q) - t
-                spread(i, blocks, y, y_u, y_v, work.q_x, work.q_s)
+                subtract_transposed(i, blocks, y, y_u, y_v, work.q_x, work.q_s)
                 store(solution, i, load(solution, i) + t * alpha)
                 r = load(work.r_x, i) - q * alpha
                 store(work.r_x, i, r)
@@ -238,7 +239,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     r = load(work.r_x, i)
                     if start != zero:
                         x = load(solution, i)
-                        w, w_u, w_v = gather(i, blocks, solution, euler_solution)
+                        w, w_u, w_v = upper_product(i, blocks, solution, euler_solution)
                         r -= w + times(load(blocks.diagonal_xx, i), x)
                         if wp.static(sliding):
                             u = load(euler_solution, 2 * i)
@@ -263,7 +264,7 @@ def define(variant: Variant) -> SimpleNamespace:
                         y_v = load(inverse_s, 2 * i + 1) * load(work.r_s, 2 * i + 1)
                         rz += load(work.r_s, 2 * i) * y_u + load(work.r_s, 2 * i + 1) * y_v
                     # what is held has y = 0 and gives others its x alone
-                    spread(
+                    subtract_transposed(
                         i, blocks,
                         y + x, y_u + u, y_v + v, work.r_x, work.r_s,
                     )  # fmt: skip

@@ -18,7 +18,7 @@ import warp as wp
 from ..core import memory
 from ..core.variant import Variant
 
-_CORRECT = """
+_CORRECT_PIVOTS = """
     for (int slot = 0; slot < stencil; ++slot) {
         const int j = neighbour.data[stencil * i + slot];
         if (j >= 0) {
@@ -58,8 +58,8 @@ def functions(variant: Variant) -> SimpleNamespace:
             m[2] * x[0] + m[4] * x[1] + m[5] * x[2],
         )
 
-    @wp.func_native(memory.rows(variant, _CORRECT))
-    def correct(
+    @wp.func_native(memory.rows(variant, _CORRECT_PIVOTS))
+    def correct_pivots(
         m: sym33, i: int, stencil: int, neighbour: wp.array(dtype=int), upper_xx: wp.array(dtype=mat33),
         pivot: wp.array(dtype=sym33),
     ):  # fmt: skip
@@ -82,14 +82,14 @@ def functions(variant: Variant) -> SimpleNamespace:
             return sym33(c00 * f, c01 * f, c02 * f, c11 * f, c12 * f, c22 * f)
         return sym33()
 
-    return SimpleNamespace(symmetric=symmetric, product=product, correct=correct, inverse_of=inverse_of)
+    return SimpleNamespace(symmetric=symmetric, product=product, correct_pivots=correct_pivots, inverse_of=inverse_of)
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, mat33, sym33 = variant.scalar, variant.mat33, variant.sym33
     load, store = memory.functions(variant).load, memory.functions(variant).store
-    symmetric, correct = functions(variant).symmetric, functions(variant).correct
+    symmetric, correct_pivots = functions(variant).symmetric, functions(variant).correct_pivots
     inverse_of = functions(variant).inverse_of
     variant.fuse("incomplete")
 
@@ -117,7 +117,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 if inverse[0] <= scalar(0.0):
                     # What was dropped made it indefinite: any positive definite E will do, so take the block itself.
                     inverse = symmetric(wp.inverse(diagonal_xx[i]))
-                correct(inverse, i, stencil, neighbour, upper_xx, inverse_pivot)
+                correct_pivots(inverse, i, stencil, neighbour, upper_xx, inverse_pivot)
             store(inverse_pivot, i, inverse)
 
     return SimpleNamespace(factorize=factorize)

@@ -54,14 +54,14 @@ class StageSolve:
         """
         a = self.model.arrays
         a.zero("evaluations")
-        self._gather()
+        self._residual()
         self.model.launch("control_adjoint", 1)
         wp.capture_while(a["iterate"], self._descend_once)
 
     def _descend_once(self) -> None:
         self._solve_part()
         self._reverse()
-        self._gather()
+        self._residual()
         self.model.launch("control_adjoint", 1)
 
     def _minimize(self, left: float, first: float) -> None:
@@ -101,7 +101,7 @@ class StageSolve:
             a[name].grad.assign(values)
         self._set_vector("rhs", total, gradient=True)
         self._run(self._reverse)
-        self._run(self._gather)
+        self._run(self._residual)
 
     def _vector(self, *names: str, gradient: bool = False) -> np.ndarray:
         """Joins an array of the positions and its companion of (u, v), as one vector; named by the first, or by
@@ -136,7 +136,7 @@ class StageSolve:
             if isinstance(array, wp.array) and array.grad is not None and array.ptr in pointers and name not in between
         )
 
-    def _gather(self) -> None:
+    def _residual(self) -> None:
         """Gathers ρ = w̄ + (∂r/∂w)ᵀ λ, of what reverse mode has gathered."""
         self.model.launch("stage_adjoint_residual", "nodes")
 
