@@ -9,8 +9,9 @@ from cases import scene
 from warp_yarn.kernels import Variant, build
 
 import warp_yarn as wy
-from warp_yarn.device.declarations import FIELDS, GROUPS, LEVELS, TOPOLOGY, Field
+from warp_yarn.device.declarations import FIELDS, GROUPS, LEVELS, TOPOLOGY
 from warp_yarn.device.declared import Struct
+from warp_yarn.device.fields import Field
 
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
 STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAdjoint", "Levels"}

@@ -18,6 +18,7 @@ from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
 from . import declarations
 from .declared import DeclaredArrays
+from .fields import conditions
 
 YARN_PARAMETERS = ("density", "stretch", "bend")
 
@@ -59,7 +60,7 @@ class Arrays(DeclaredArrays):
         }
         dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "pin")}
         dims["applied"] = sizes["applied"]
-        super().__init__(variant, device, declarations.conditions(scene, variant, self.terms), sizes, dims)
+        super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)
         for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):

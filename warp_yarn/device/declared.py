@@ -7,7 +7,7 @@ import warp as wp
 
 from ..kernels import Variant, build
 from . import declarations
-from .declarations import Field
+from .fields import Field, Group
 
 Struct: Any = wp._src.codegen.Struct
 """The type of a kernel's argument that is a struct (Warp 1.19 has no public name for it)."""
@@ -22,7 +22,7 @@ class DeclaredArrays(dict[str, Any]):
     Args:
         variant: of the kernels.
         device: of Warp.
-        conditions: those that hold for the scene (``declarations.conditions``).
+        conditions: those that hold for the scene (``fields.conditions``).
         sizes: how many there are of each element.
         dims: how many threads a launch over elements has.
 
@@ -70,7 +70,7 @@ class DeclaredArrays(dict[str, Any]):
             raise KeyError(f"{name!r} is not declared in warp_yarn/device/declarations.py")
         return self.declared[name]
 
-    def make(self, group: declarations.Group) -> None:
+    def make(self, group: Group) -> None:
         """Make the arrays of a group, of 0; those that are there stay, and None stands for what the scene has not."""
         for name in group:
             if name not in self:
