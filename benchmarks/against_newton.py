@@ -85,6 +85,7 @@ class Ours:
     def __init__(self, size: int, duration: float, step: float, every: int):
         # Newton's processes have no use for torch.
         import torch
+
         import warp_yarn.torch as wt
 
         torch.set_num_threads(1)

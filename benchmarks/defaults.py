@@ -36,6 +36,7 @@ import warp as wp
 from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
+from warp_yarn.device.defaults import stretch_rate
 from warp_yarn.presets.fabrics import FABRICS
 from warp_yarn.simulation.state import CLOTH_NUMBERS
 
@@ -235,7 +236,7 @@ def compare(case: Case, integrator: str = "sdirk2", newton_tolerance: float | No
     row: dict[str, Any] = {**dataclasses.asdict(case), "wind": case.wind is not None, "speed": "", "spin": ""}
     row["speed"], row["spin"] = (float(np.linalg.norm(v)) for v in (case.speed, case.spin))
     model = by_default.simulator.model
-    row["k_s h²/(m L)"] = float((model._stretch_rate().max() * case.step) ** 2)
+    row["k_s h²/(m L)"] = float((stretch_rate(model.scene).max() * case.step) ** 2)
     row["preconditioner"] = model.preconditioner
     row |= {"ratio": "", "doubt": "", "of motion": "", "of all": "", "error": "", "gain": "", "gain of tight": ""}
     row["split"], row["damped"] = len(by_default.simulator.split_steps), len(by_default.simulator.damped_steps)

@@ -36,11 +36,11 @@ from typing import Any
 
 import torch
 import warp as wp
-import warp_yarn.torch as wt
 from common import RESULTS, Timing, environment, measure, one_core, print_table, write_csv
 from memory import resident, settle
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.presets import paper
 
 WANTED = (

@@ -109,7 +109,7 @@ def count(scene: wy.Scene, state: wy.State, length: float, preconditioner: str, 
     def solve(most: int, tolerance: float) -> int:
         a.put("tolerance", tolerance)
         arrays = {name: a[name] for name in SOLVED}
-        model.launch(f"{preconditioner}_conjugate_gradient", 1, strip=0, most_iterations=most, **arrays)
+        model.launch(f"{preconditioner}_conjugate_gradient", 1, thread=0, most_iterations=most, **arrays)
         return int(a["iterations"].numpy()[0])
 
     sizes = []

@@ -10,10 +10,10 @@ A falling cloth of one yarn stays as it is, and its velocity is g τ (1 − exp(
 
 import numpy as np
 import warp as wp
-import warp_yarn.torch as wt
 from warp_yarn.kernels.core.indexing import coordinates, index
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 
 
 def define(variant: wy.Variant) -> wp.Kernel:
@@ -30,7 +30,7 @@ def define(variant: wy.Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         momentum: wp.array(dtype=vec3),
         matrix: int,
-        weights: wp.array(dtype=vec3),
+        coefficients: wp.array(dtype=vec3),
         diagonal_xx: wp.array(dtype=mat33),
     ):
         e = index(wp.tid())
@@ -40,8 +40,8 @@ def define(variant: wy.Variant) -> wp.Kernel:
             i = index(segment_nodes[e][end])
             wp.atomic_add(force, i, velocity[i] * (-c))
             if matrix != 0:
-                wp.atomic_add(momentum, i, velocity[i] * (weights[0][1] * c))
-                wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (weights[0][1] * c))
+                wp.atomic_add(momentum, i, velocity[i] * (coefficients[0][1] * c))
+                wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (coefficients[0][1] * c))
 
     return linear_drag_term
 

@@ -10,9 +10,15 @@ import functools
 import warp as wp
 
 from .core.variant import Term, TermParameter, Variant
-from .linear import block_matrix, conjugate_gradient, incomplete_cholesky, multilevel
-from .nonlinear import newton
-from .stepping import energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
+from .linear import (
+    block_matrix,
+    conjugate_gradient,
+    incomplete_cholesky,
+    multilevel,
+    multilevel_conjugate_gradient,
+)
+from .nonlinear import line_search, newton
+from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
 from .terms import (
     applied_force,
     bending,
@@ -103,7 +109,10 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does by itself, one
     # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
-    kernels = {"contact_normal": crossing_normal.define_normal(variant), "drag_anchor": friction.define_anchor(variant)}
+    kernels = {
+        "contact_normal": crossing_normal.define_normal(variant),
+        "update_anchor": friction.define_anchor(variant),
+    }
     for term in _OWN:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
@@ -116,7 +125,10 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         incomplete_cholesky,
         conjugate_gradient,
         multilevel,
+        multilevel_conjugate_gradient,
+        dirk,
         newton,
+        line_search,
         energy_watch,
         frames,
         linear_adjoint,

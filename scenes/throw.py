@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import torch
 import tqdm
-import warp_yarn.torch as wt
 from common import add_slowdown, command, file_ending, make_folders, write_all
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.errors import finite_array, number, whole
 from warp_yarn.io.files import whole_file
 from warp_yarn.io.usd import ENDINGS

@@ -5,10 +5,10 @@ import functools
 import numpy as np
 import pytest
 import torch
-import warp_yarn.torch as wt
 from warp_yarn.kernels.stepping.energy_watch import EVERY
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.presets.fabrics import FABRICS
 
@@ -206,7 +206,7 @@ SCENES = (still, falling, hung, windy, gusty, carried)
 def watched(fabric: str, acts, method: str, sliding: bool, *, watches: bool, step: float = 1e-3) -> wy.Simulator:
     cloth = FABRICS[fabric](rows=5, columns=5, pose="flat")
     simulator = wy.Simulator(wy.Scene(cloth, sliding=sliding, **acts(cloth)), integrator=method, step=step)
-    simulator.model.watches &= watches
+    simulator.model.energy.on &= watches
     return simulator
 
 

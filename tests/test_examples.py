@@ -16,13 +16,13 @@ import pytest
 import torch
 import warp as wp
 import warp_yarn.learn as wl
-import warp_yarn.torch as wt
 from cases import joined, make_state
 from scripts import load
 from warp_yarn.kernels import TERMS, in_order
 from warp_yarn.kernels.core.indexing import coordinates, index
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.integrators.stage import StageMethod
 from warp_yarn.simulation.ablation import ablate
@@ -279,7 +279,7 @@ def tether(variant: wy.Variant, sign: float = 1.0) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
         matrix: int,
-        weights: wp.array(dtype=vec3),
+        coefficients: wp.array(dtype=vec3),
         diagonal_xx: wp.array(dtype=mat33),
     ):
         e = index(wp.tid())
@@ -293,7 +293,7 @@ def tether(variant: wy.Variant, sign: float = 1.0) -> wp.Kernel:
             k = half * (euler[sb] - euler[sa])
             wp.atomic_add(force, i, offset * (-k))
             if matrix != 0:
-                wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (weights[0][2] * k))
+                wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (coefficients[0][2] * k))
         if wp.static(variant.sliding):
             wp.atomic_add(euler_force, sa, stored)
             wp.atomic_add(euler_force, sb, -stored)

@@ -15,7 +15,7 @@ import warp as wp
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
-from warp_yarn.device import arrays
+from warp_yarn.device import declared
 from warp_yarn.gradients.inputs import NUMBERS, VECTORS
 
 YARNS = [wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4), wy.Yarn(density=2.5e-3, stretch=1.7e5, bend=1.1e-4)]
@@ -282,7 +282,7 @@ def test_large_arrays_are_cleared_beside_the_tape(monkeypatch: pytest.MonkeyPatc
     """By a kernel of ours, where small ones are by Warp: the gradient is the same, and Warp has nothing to warn of."""
     gradients = []
     for least in (1 << 40, 64):
-        monkeypatch.setattr(arrays, "LARGE", least)
+        monkeypatch.setattr(declared, "LARGE", least)
         rollout = wt.Rollout(scene_for("plain", 2), 2, integrator=method)
         shear = rollout.defaults["shear"].clone().requires_grad_()
         rollout(shear=shear).position[-1].square().sum().backward()

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-import warp_yarn.torch as wt
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.presets import paper
 
 RUNS = 10

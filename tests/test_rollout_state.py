@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-import warp_yarn.torch as wt
 from test_gradients import WIND, cloth, gradcheck, jittered, scene_for
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.simulation.state import FIELDS
 
@@ -98,7 +98,7 @@ def interrupt(rollout: wt.Rollout, random: np.random.Generator, monkeypatch: pyt
     """Ctrl-C in a run, one that fails or its backward pass: before or after one of what they consist of."""
     simulator = rollout.simulator
     places = [(simulator, name) for name in ("run_chunk", "fail")]
-    places += [(simulator.integrator, name) for name in ("advance", "retreat", "set_times", "prepare_adjoint")]
+    places += [(simulator.integrator, name) for name in ("advance", "backward_step", "set_times", "prepare_adjoint")]
     owner, name = places[random.integers(len(places))]
     left, before, real = [random.integers(4)], random.random() < 0.5, getattr(owner, name)
 

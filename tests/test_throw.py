@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import warp_yarn.torch as wt
 from scripts import exit_code, load, samples
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 
 throw = load("scenes/throw.py")
 gradients = load("benchmarks/gradients.py")

@@ -27,7 +27,7 @@ STENCILS = (0, 2, 4, 6)
 SUMS_OF_ENERGY = ("", "elastic_energy", "height_energy")
 OTHER_INPUTS = ("sliding", "state", "steps_done", "forces", "pin_path")
 """What calls and ablations say beside the names of terms, parameters and arrays."""
-METHOD = ("name", "order", "fallback", "local_error", "set_times", "advance", "prepare_adjoint", "retreat")
+METHOD = ("name", "order", "fallback", "local_error", "set_times", "advance", "prepare_adjoint", "backward_step")
 STAGES = ("fraction", "carried", "stages")
 """What a method has, and a StageMethod as well."""
 _OWN_METHODS = frozenset(INTEGRATORS)
@@ -192,8 +192,8 @@ def _check_kernel(term: Term, kernel: Any) -> None:
         raise InputError(f"term {term.name!r} reads the contact's normal, must have needs_contact=True")
     if "contact_load" in labels and not (term.needs_contact or term.presses):
         raise InputError(f"term {term.name!r} has contact_load, must have needs_contact=True or presses=True")
-    if "weights[0][1]" in kernel.adj.source and not term.explicit_in_ros2:
-        raise InputError(f"term {term.name!r} adds a damping, weights[0][1], must have explicit_in_ros2=True")
+    if "coefficients[0][1]" in kernel.adj.source and not term.explicit_in_ros2:
+        raise InputError(f"term {term.name!r} adds a damping, coefficients[0][1], must have explicit_in_ros2=True")
 
 
 def _arguments(kernels: dict[str, wp.Kernel], term: str) -> list[Any]:

@@ -35,7 +35,8 @@ _ROWS = """
 
 
 def rows(variant: Variant, snippet: str) -> str:
-    """A function's C++ with the variant's scalar in place of SCALAR, 1 or 0 in place of SLIDING, and a ``row`` of four.
+    """Make a function's C++ with the variant's scalar in place of SCALAR, 1 or 0 in place of SLIDING, and a ``row`` of
+    four.
 
     The row of a 3 × 3 block has three: the fourth is the next number in memory, and counts for nothing. Behind every
     block with a neighbour stands another, for the last node has no upper neighbour.
@@ -46,31 +47,31 @@ def rows(variant: Variant, snippet: str) -> str:
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """``at(array, i)`` and ``put(array, i, value)``, of every type that the solver's arrays have."""
+    """Make ``load(array, i)`` and ``store(array, i, value)``, of every type that the solver's arrays have."""
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
 
     @wp.func_native(_READ)
-    def at(array: wp.array(dtype=int), i: int) -> int: ...
+    def load(array: wp.array(dtype=int), i: int) -> int: ...
 
     @wp.func_native(_READ)
-    def at(array: wp.array(dtype=scalar), i: int) -> scalar: ...  # noqa: F811
+    def load(array: wp.array(dtype=scalar), i: int) -> scalar: ...  # noqa: F811
 
     @wp.func_native(_READ)
-    def at(array: wp.array(dtype=vec3), i: int) -> vec3: ...  # noqa: F811
+    def load(array: wp.array(dtype=vec3), i: int) -> vec3: ...  # noqa: F811
 
     @wp.func_native(_READ)
-    def at(array: wp.array(dtype=mat33), i: int) -> mat33: ...  # noqa: F811
+    def load(array: wp.array(dtype=mat33), i: int) -> mat33: ...  # noqa: F811
 
     @wp.func_native(_READ)
-    def at(array: wp.array(dtype=sym33), i: int) -> sym33: ...  # noqa: F811
+    def load(array: wp.array(dtype=sym33), i: int) -> sym33: ...  # noqa: F811
 
     @wp.func_native(_WRITE)
-    def put(array: wp.array(dtype=scalar), i: int, value: scalar): ...
+    def store(array: wp.array(dtype=scalar), i: int, value: scalar): ...
 
     @wp.func_native(_WRITE)
-    def put(array: wp.array(dtype=vec3), i: int, value: vec3): ...  # noqa: F811
+    def store(array: wp.array(dtype=vec3), i: int, value: vec3): ...  # noqa: F811
 
     @wp.func_native(_WRITE)
-    def put(array: wp.array(dtype=sym33), i: int, value: sym33): ...  # noqa: F811
+    def store(array: wp.array(dtype=sym33), i: int, value: sym33): ...  # noqa: F811
 
-    return SimpleNamespace(at=at, put=put)
+    return SimpleNamespace(load=load, store=store)

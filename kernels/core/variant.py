@@ -27,7 +27,7 @@ class Variant:
 
     @property
     def forward(self) -> "Variant":
-        """The variant without reverse mode, of kernels that never need it."""
+        """Give the variant without reverse mode, of kernels that never need it."""
         return dataclasses.replace(self, reverse=False)
 
     @property
@@ -40,11 +40,11 @@ class Variant:
 
     @property
     def sym33(self) -> type:
-        """A symmetric matrix: 00, 01, 02, 11, 12, 22."""
+        """Give the type of a symmetric matrix: 00, 01, 02, 11, 12, 22."""
         return wp.types.vector(6, self.scalar)
 
     def module(self, name: str) -> str:
-        """Name of the Warp module that this variant's kernels of one kind are compiled into.
+        """Name the Warp module that this variant's kernels of one kind are compiled into.
 
         One module a variant: typing.Any kernels would rebuild their module at every new instantiation.
         """
@@ -120,8 +120,8 @@ class Term:
     sliding_only: bool = False
     """Whether the term vanishes identically where yarns do not slide."""
     presses: bool = False
-    """Whether the term presses yarns together (eq. 3): its kernel then adds to ``contact_load`` where ``press`` is not
-    0. Such terms stand before those that need the contact."""
+    """Whether the term presses yarns together (eq. 3): its kernel then adds to ``contact_load`` where
+    ``add_contact_load`` is not 0. Such terms stand before those that need the contact."""
     reads_forces: bool = False
     """Whether the term reads the sum of the others' forces: it then stands last."""
     energy_watched_as: str = ""
@@ -131,7 +131,7 @@ class Term:
     works: bool = False
     """Whether the term does work on the cloth and has no energy, as wind does. What can only brake need not say so."""
     explicit_in_ros2: bool = False
-    """Whether ROS2 leaves the term out of its matrix. One that adds a damping D, ``weights[0][1]``, has to be: the
+    """Whether ROS2 leaves the term out of its matrix. One that adds a damping D, ``coefficients[0][1]``, has to be: the
     second solve of ROS2 knows no D but friction's."""
     kept: bool = False
     """Whether an ablation never leaves the term out, as it is what is done to the cloth."""

@@ -22,16 +22,17 @@ import warp as wp
 
 from ..core import memory
 from ..core.status import NOT_CONVERGED, NOT_FINITE
+from ..core.structs import structs
 from ..core.variant import Variant
 
 UPPER = """
     row a = {}, b = {}, c = {}, x_s = {}, u_x = {}, v_x = {};
     SCALAR u_s = 0, v_s = 0;
     auto add = [&](int slot, int direction, row& s_x, SCALAR& s_s) {
-        const int j = neighbour.data[stencil * i + slot];
+        const int j = blocks.neighbour.data[blocks.stencil * i + slot];
         if (j < 0)
             return;
-        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+        const SCALAR* m = blocks.upper_xx.data[blocks.stencil * i + slot].data[0];
         const SCALAR* of = x.data[j].c;
         const row its = {of[0], of[1], of[2], 0};
         a = a + *(const row*)m * its;
@@ -41,18 +42,18 @@ UPPER = """
         if (slot < 4) {
             const int k = 4 * i + slot;
             const SCALAR along = s.data[2 * j + direction];
-            x_s = x_s + *(const row*)upper_xs.data[k].c * along;
-            s_x = s_x + *(const row*)upper_sx.data[k].c * its;
-            s_s += upper_ss.data[k] * along;
+            x_s = x_s + *(const row*)blocks.upper_xs.data[k].c * along;
+            s_x = s_x + *(const row*)blocks.upper_sx.data[k].c * its;
+            s_s += blocks.upper_ss.data[k] * along;
         }
 #endif
     };
 """
 """C++ that adds up row i of U (x, s), slot by slot."""
-_GATHER = (
+_UPPER_PRODUCT = (
     UPPER
     + """
-    for (int slot = stencil - 1; slot >= 0; --slot) {
+    for (int slot = blocks.stencil - 1; slot >= 0; --slot) {
         add(slot, 1, v_x, v_s);
 #if SLIDING
         add(--slot, 0, u_x, u_s);
@@ -71,12 +72,12 @@ _GATHER = (
     return y;
 """
 )
-_SPREAD = """
+_SUBTRACT_TRANSPOSED = """
     auto take = [&](int slot, int direction, SCALAR along) {
-        const int j = neighbour.data[stencil * i + slot];
+        const int j = blocks.neighbour.data[blocks.stencil * i + slot];
         if (j < 0)
             return;
-        const SCALAR* m = upper_xx.data[stencil * i + slot].data[0];
+        const SCALAR* m = blocks.upper_xx.data[blocks.stencil * i + slot].data[0];
         SCALAR* of = y_x.data[j].c;
         row its = {of[0], of[1], of[2], 0};
         its = its - *(const row*)m * x.c[0];
@@ -85,15 +86,15 @@ _SPREAD = """
 #if SLIDING
         if (slot < 4) {
             const int k = 4 * i + slot;
-            its = its - *(const row*)upper_sx.data[k].c * along;
-            y_s.data[2 * j + direction] -= wp::dot(upper_xs.data[k], x) + upper_ss.data[k] * along;
+            its = its - *(const row*)blocks.upper_sx.data[k].c * along;
+            y_s.data[2 * j + direction] -= wp::dot(blocks.upper_xs.data[k], x) + blocks.upper_ss.data[k] * along;
         }
 #endif
         of[0] = its[0];
         of[1] = its[1];
         of[2] = its[2];
     };
-    for (int slot = 0; slot < stencil; ++slot) {
+    for (int slot = 0; slot < blocks.stencil; ++slot) {
         take(slot, 0, u);
 #if SLIDING
         take(++slot, 1, v);
@@ -104,161 +105,127 @@ _SPREAD = """
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """What both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
+    """Make what both preconditioned iterations share. U is the upper half of A, without its diagonal blocks."""
     scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
     vec5 = wp.types.vector(5, scalar)
-    at, put = memory.functions(variant).at, memory.functions(variant).put
+    load, store = memory.functions(variant).load, memory.functions(variant).store
+    BlockMatrix, SolveReport = structs(variant).BlockMatrix, structs(variant).SolveReport
 
     @wp.func
     def times(m: mat33, x: vec3) -> vec3:
-        """m x. By rows, as they lie in memory: Warp's own product goes by columns."""
+        """Compute m x. By rows, as they lie in memory: Warp's own product goes by columns."""
         return vec3(wp.dot(m[0], x), wp.dot(m[1], x), wp.dot(m[2], x))
 
-    @wp.func_native(memory.rows(variant, _GATHER))
-    def gather_together(
+    @wp.func_native(memory.rows(variant, _UPPER_PRODUCT))
+    def upper_product_together(
         i: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         x: wp.array(dtype=vec3),
         s: wp.array(dtype=scalar),
     ) -> vec5: ...
 
     @wp.func
-    def gather(
+    def upper_product(
         i: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         x: wp.array(dtype=vec3),
         s: wp.array(dtype=scalar),
     ):
-        """Row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
-        y = gather_together(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, x, s)
+        """Add up row i of U (x, s): of the position, u and v. The next node comes last: a sweep has it latest."""
+        y = upper_product_together(i, blocks, x, s)
         return vec3(y[0], y[1], y[2]), y[3], y[4]
 
-    @wp.func_native(memory.rows(variant, _SPREAD))
-    def spread(
+    @wp.func_native(memory.rows(variant, _SUBTRACT_TRANSPOSED))
+    def subtract_transposed(
         i: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         x: vec3,
         u: scalar,
         v: scalar,
         y_x: wp.array(dtype=vec3),
         y_s: wp.array(dtype=scalar),
     ):
-        """y −= Uᵀ (x, u, v), what row i of U gives to others."""
+        """Add up y −= Uᵀ (x, u, v), what row i of U gives to others."""
         ...
 
     @wp.func
     def multiply(
         nodes: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         p_x: wp.array(dtype=vec3),
         p_s: wp.array(dtype=scalar),
         q_x: wp.array(dtype=vec3),
         q_s: wp.array(dtype=scalar),
     ):
-        """q += A p. One pass: a row adds its upper half to itself, and the transposed blocks to its neighbours."""
+        """Add up q += A p. One pass: a row adds its upper half to itself, and the transposed blocks to its
+        neighbours."""
         u = scalar(0.0)
         v = scalar(0.0)
         for i in range(nodes):
-            x = at(p_x, i)
-            y, y_u, y_v = gather(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s)
-            y += times(at(diagonal_xx, i), x)
+            x = load(p_x, i)
+            y, y_u, y_v = upper_product(i, blocks, p_x, p_s)
+            y += times(load(blocks.diagonal_xx, i), x)
             if wp.static(sliding):
-                u = at(p_s, 2 * i)
-                v = at(p_s, 2 * i + 1)
-                xs_u = at(diagonal_xs, 2 * i)
-                xs_v = at(diagonal_xs, 2 * i + 1)
+                u = load(p_s, 2 * i)
+                v = load(p_s, 2 * i + 1)
+                xs_u = load(blocks.diagonal_xs, 2 * i)
+                xs_v = load(blocks.diagonal_xs, 2 * i + 1)
                 y += xs_u * u + xs_v * v
-                put(q_s, 2 * i, at(q_s, 2 * i) + y_u + wp.dot(xs_u, x) + at(diagonal_ss, 2 * i) * u)
-                put(q_s, 2 * i + 1, at(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + at(diagonal_ss, 2 * i + 1) * v)
-            put(q_x, i, at(q_x, i) + y)
-            spread(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, -x, -u, -v, q_x, q_s)
+                store(q_s, 2 * i, load(q_s, 2 * i) + y_u + wp.dot(xs_u, x) + load(blocks.diagonal_ss, 2 * i) * u)
+                store(
+                    q_s,
+                    2 * i + 1,
+                    load(q_s, 2 * i + 1) + y_v + wp.dot(xs_v, x) + load(blocks.diagonal_ss, 2 * i + 1) * v,
+                )
+            store(q_x, i, load(q_x, i) + y)
+            subtract_transposed(i, blocks, -x, -u, -v, q_x, q_s)
 
     @wp.func
-    def report(
-        count: int,
-        rz: scalar,
-        size: scalar,
-        limit: scalar,
-        iterations: wp.array(dtype=int),
-        residual: wp.array(dtype=scalar),
-        status: wp.array(dtype=int),
-    ) -> bool:
-        """Writes how the iteration ended; whether it failed, and no step before it had."""
-        iterations[0] = count
-        residual[0] = wp.sqrt(wp.max(rz, scalar(0.0)) / wp.max(size, scalar(1.0e-30)))
-        if rz <= limit or status[0] != 0:
+    def write_report(count: int, rz: scalar, size: scalar, limit: scalar, report: SolveReport) -> bool:
+        """Write how the iteration ended; return whether it failed, and no step before it had."""
+        report.iterations[0] = count
+        report.residual[0] = wp.sqrt(wp.max(rz, scalar(0.0)) / wp.max(size, scalar(1.0e-30)))
+        if rz <= limit or report.status[0] != 0:
             return False
-        status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
+        report.status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
         return True
 
-    return SimpleNamespace(times=times, gather=gather, spread=spread, multiply=multiply, report=report)
+    return SimpleNamespace(
+        times=times,
+        upper_product=upper_product,
+        subtract_transposed=subtract_transposed,
+        multiply=multiply,
+        write_report=write_report,
+    )
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
-    multiply, report = functions(variant).multiply, functions(variant).report
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    multiply, write_report = functions(variant).multiply, functions(variant).write_report
     module = variant.module("solver")
+    BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
+    SolveReport = structs(variant).SolveReport
 
     @wp.kernel(module=module, enable_backward=False)
     def apply_matrix(
         nodes: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         p_x: wp.array(dtype=vec3),
         p_s: wp.array(dtype=scalar),
         q_x: wp.array(dtype=vec3),
         q_s: wp.array(dtype=scalar),
     ):
-        """q += A p."""
+        """Add up q += A p."""
         multiply(
-            nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
-            upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
+            nodes, blocks, p_x, p_s, q_x, q_s,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
     def jacobi_conjugate_gradient(
         # matrix
         nodes: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_x: wp.array(dtype=vec3),
         inverse_s: wp.array(dtype=scalar),
         # right-hand side, and when to stop
@@ -269,96 +236,86 @@ def define(variant: Variant) -> SimpleNamespace:
         # start in, solution out
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
-        # work space
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
-        p_x: wp.array(dtype=vec3),
-        p_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
-        # report out
-        iterations: wp.array(dtype=int),
-        residual: wp.array(dtype=scalar),
-        status: wp.array(dtype=int),
+        work: SolverWork,
+        report: SolveReport,
     ):
-        """A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch of one thread.
+        """Solve A · solution = rhs, to √(r·P⁻¹r) ≤ tolerance times what it was at the start, in one launch of one
+        thread.
 
         What is held still has an inverse diagonal of 0, so it keeps its value, enters the right-hand side through
         the first residual, and its row of the residual is what holding it takes.
         """
         zero = scalar(0.0)
         for i in range(nodes):
-            q_x[i] = vec3()
+            work.q_x[i] = vec3()
             if wp.static(sliding):
-                q_s[2 * i] = zero
-                q_s[2 * i + 1] = zero
+                work.q_s[2 * i] = zero
+                work.q_s[2 * i + 1] = zero
         multiply(
-            nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
-            upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution, q_x, q_s,
+            nodes, blocks, solution, euler_solution, work.q_x, work.q_s,
         )  # fmt: skip
         rz = zero
         for i in range(nodes):
-            r = rhs[i] - q_x[i]
+            r = rhs[i] - work.q_x[i]
             z = wp.cw_mul(inverse_x[i], r)
             rz += wp.dot(r, z)
-            r_x[i] = r
-            p_x[i] = z
-            q_x[i] = vec3()
+            work.r_x[i] = r
+            work.p_x[i] = z
+            work.q_x[i] = vec3()
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    r_1 = euler_rhs[s] - q_s[s]
+                    r_1 = euler_rhs[s] - work.q_s[s]
                     z_1 = inverse_s[s] * r_1
                     rz += r_1 * z_1
-                    r_s[s] = r_1
-                    p_s[s] = z_1
-                    q_s[s] = zero
+                    work.r_s[s] = r_1
+                    work.p_s[s] = z_1
+                    work.q_s[s] = zero
 
         size = rz
         limit = tolerance[0] * tolerance[0] * size
         count = int(0)
         while count < most_iterations and rz > limit:
             multiply(
-                nodes, stencil, neighbour, diagonal_xx, diagonal_xs, diagonal_ss,
-                upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
+                nodes, blocks, work.p_x, work.p_s, work.q_x, work.q_s,
             )  # fmt: skip
             pq = zero
             for i in range(nodes):
-                pq += wp.dot(p_x[i], q_x[i])
+                pq += wp.dot(work.p_x[i], work.q_x[i])
                 if wp.static(sliding):
-                    pq += p_s[2 * i] * q_s[2 * i] + p_s[2 * i + 1] * q_s[2 * i + 1]
+                    pq += work.p_s[2 * i] * work.q_s[2 * i] + work.p_s[2 * i + 1] * work.q_s[2 * i + 1]
             if not (pq > zero):
                 # past the attainable accuracy, or not finite
                 break
             alpha = rz / pq
             rz_next = zero
             for i in range(nodes):
-                solution[i] = solution[i] + p_x[i] * alpha
-                r = r_x[i] - q_x[i] * alpha
+                solution[i] = solution[i] + work.p_x[i] * alpha
+                r = work.r_x[i] - work.q_x[i] * alpha
                 rz_next += wp.dot(r, wp.cw_mul(inverse_x[i], r))
-                r_x[i] = r
-                q_x[i] = vec3()
+                work.r_x[i] = r
+                work.q_x[i] = vec3()
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        euler_solution[s] = euler_solution[s] + p_s[s] * alpha
-                        r_1 = r_s[s] - q_s[s] * alpha
+                        euler_solution[s] = euler_solution[s] + work.p_s[s] * alpha
+                        r_1 = work.r_s[s] - work.q_s[s] * alpha
                         rz_next += r_1 * inverse_s[s] * r_1
-                        r_s[s] = r_1
-                        q_s[s] = zero
+                        work.r_s[s] = r_1
+                        work.q_s[s] = zero
             beta = rz_next / rz
             rz = rz_next
             for i in range(nodes):
-                p_x[i] = wp.cw_mul(inverse_x[i], r_x[i]) + p_x[i] * beta
+                work.p_x[i] = wp.cw_mul(inverse_x[i], work.r_x[i]) + work.p_x[i] * beta
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        p_s[s] = inverse_s[s] * r_s[s] + p_s[s] * beta
+                        work.p_s[s] = inverse_s[s] * work.r_s[s] + work.p_s[s] * beta
             count += 1
 
-        if report(count, rz, size, limit, iterations, residual, status):
+        if write_report(count, rz, size, limit, report):
             worst = scalar(-1.0)
             for i in range(nodes):
-                here = wp.dot(r_x[i], wp.cw_mul(inverse_x[i], r_x[i]))
+                here = wp.dot(work.r_x[i], wp.cw_mul(inverse_x[i], work.r_x[i]))
                 if not (here <= worst):
                     worst = here
-                    status[1] = i
+                    report.status[1] = i
 
     return SimpleNamespace(apply_matrix=apply_matrix, jacobi_conjugate_gradient=jacobi_conjugate_gradient)

@@ -11,7 +11,7 @@ Of q, row i has given the rows behind it its part of Uᵀ (t − E⁻¹q) when t
 there is to do with a node's vectors while they are at hand, and of the diagonal blocks the iteration reads D once and
 E⁻¹ twice, E never. They count their columns by hand: the object that Warp makes of a range costs 3 % of a step.
 
-``team.py`` tells how processor cores share the sweeps.
+``threads.py`` tells how processor cores share the sweeps.
 """
 
 import functools
@@ -20,60 +20,50 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core import memory
+from ..core.structs import structs
 from ..core.variant import Variant
 from . import block_matrix, incomplete_cholesky
-from . import threads as teams
-from .threads import call, ended, keep_pace, meet, share, wait_for_call
+from . import threads as synchronization
+from .threads import barrier, begin_solve, ended, keep_pace, partition, wait_for_solve
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, mat33, sym33, sliding = (
-        variant.scalar, variant.vec3, variant.mat33, variant.sym33, variant.sliding,
+    scalar, vec3, sym33, sliding = (
+        variant.scalar, variant.vec3, variant.sym33, variant.sliding,
     )  # fmt: skip
-    at, put = memory.functions(variant).at, memory.functions(variant).put
-    times, gather, spread = (getattr(block_matrix.functions(variant), name) for name in ("times", "gather", "spread"))
-    report = block_matrix.functions(variant).report
+    load, store = memory.functions(variant).load, memory.functions(variant).store
+    shared = block_matrix.functions(variant)
+    times, upper_product, subtract_transposed = shared.times, shared.upper_product, shared.subtract_transposed
+    write_report = shared.write_report
+    BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
+    SolveReport = structs(variant).SolveReport
     symmetric, product = (
         incomplete_cholesky.functions(variant).symmetric,
         incomplete_cholesky.functions(variant).product,
     )
-    total = teams.functions(variant).total
+    total = synchronization.functions(variant).total
     module = variant.module("conjugate_gradient")
     variant.fuse("conjugate_gradient")
 
     @wp.func
     def backward_sweep(
-        strip: int,
-        strips: int,
+        thread: int,
+        threads: int,
         swept: int,
-        team: wp.array(dtype=int),
+        signals: wp.array(dtype=int),
         nodes: int,
         columns: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         beta: scalar,
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
-        p_x: wp.array(dtype=vec3),
-        p_s: wp.array(dtype=scalar),
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
+        work: SolverWork,
     ) -> scalar:
-        """p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a strip, and its part of t·A t."""
-        first = share(columns, strip, strips)
-        width = share(columns, strip + 1, strips) - first
+        """Sweep backwards: p ← r + β p, t = (E + U)⁻¹ p, q = (D + U) t in a thread's columns, and their part of t·A
+        t."""
+        first = partition(columns, thread, threads)
+        width = partition(columns, thread + 1, threads) - first
         rows = nodes / columns
         curvature = scalar(0.0)
         for row in range(rows):
@@ -81,68 +71,59 @@ def define(variant: Variant) -> SimpleNamespace:
             begin = (rows - 1 - row) * columns + first
             column = width - 1
             while column >= 0:
-                if strips > 1:
-                    keep_pace(team, strip, strip + 1, strip - 1, strips, width - 1 - column, width, swept + row)
+                if threads > 1:
+                    keep_pace(signals, thread, thread + 1, thread - 1, threads, width - 1 - column, width, swept + row)
                 i = begin + column
-                w, w_u, w_v = gather(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, t_x, t_s)
-                p = at(r_x, i) + at(p_x, i) * beta
-                t = product(at(inverse_pivot, i), p - w)
-                q = w + product(symmetric(at(diagonal_xx, i)), t)
-                put(p_x, i, p)
-                put(t_x, i, t)
+                w, w_u, w_v = upper_product(i, blocks, work.t_x, work.t_s)
+                p = load(work.r_x, i) + load(work.p_x, i) * beta
+                t = product(load(inverse_pivot, i), p - w)
+                q = w + product(symmetric(load(blocks.diagonal_xx, i)), t)
+                store(work.p_x, i, p)
+                store(work.t_x, i, t)
                 if wp.static(sliding):
-                    p_u = at(r_s, 2 * i) + at(p_s, 2 * i) * beta
-                    p_v = at(r_s, 2 * i + 1) + at(p_s, 2 * i + 1) * beta
-                    u = at(inverse_s, 2 * i) * (p_u - w_u)
-                    v = at(inverse_s, 2 * i + 1) * (p_v - w_v)
-                    xs_u = at(diagonal_xs, 2 * i)
-                    xs_v = at(diagonal_xs, 2 * i + 1)
+                    p_u = load(work.r_s, 2 * i) + load(work.p_s, 2 * i) * beta
+                    p_v = load(work.r_s, 2 * i + 1) + load(work.p_s, 2 * i + 1) * beta
+                    u = load(inverse_s, 2 * i) * (p_u - w_u)
+                    v = load(inverse_s, 2 * i + 1) * (p_v - w_v)
+                    xs_u = load(blocks.diagonal_xs, 2 * i)
+                    xs_v = load(blocks.diagonal_xs, 2 * i + 1)
                     q += xs_u * u + xs_v * v
-                    q_u = w_u + wp.dot(xs_u, t) + at(diagonal_ss, 2 * i) * u
-                    q_v = w_v + wp.dot(xs_v, t) + at(diagonal_ss, 2 * i + 1) * v
-                    put(p_s, 2 * i, p_u)
-                    put(p_s, 2 * i + 1, p_v)
-                    put(t_s, 2 * i, u)
-                    put(t_s, 2 * i + 1, v)
-                    put(q_s, 2 * i, q_u)
-                    put(q_s, 2 * i + 1, q_v)
+                    q_u = w_u + wp.dot(xs_u, t) + load(blocks.diagonal_ss, 2 * i) * u
+                    q_v = w_v + wp.dot(xs_v, t) + load(blocks.diagonal_ss, 2 * i + 1) * v
+                    store(work.p_s, 2 * i, p_u)
+                    store(work.p_s, 2 * i + 1, p_v)
+                    store(work.t_s, 2 * i, u)
+                    store(work.t_s, 2 * i + 1, v)
+                    store(work.q_s, 2 * i, q_u)
+                    store(work.q_s, 2 * i + 1, q_v)
                     curvature += u * (q_u + w_u) + v * (q_v + w_v)
-                put(q_x, i, q)
+                store(work.q_x, i, q)
                 curvature += wp.dot(t, q + w)
                 column -= 1
-            if strips > 1:
-                ended(team, strip, swept + row + 1)
+            if threads > 1:
+                ended(signals, thread, swept + row + 1)
         return curvature
 
     @wp.func
     def forward_sweep(
-        strip: int,
-        strips: int,
+        thread: int,
+        threads: int,
         swept: int,
-        team: wp.array(dtype=int),
+        signals: wp.array(dtype=int),
         nodes: int,
         columns: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         alpha: scalar,
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
+        work: SolverWork,
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
     ) -> scalar:
-        """q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a strip, and its part of r·E⁻¹r."""
-        first = share(columns, strip, strips)
-        width = share(columns, strip + 1, strips) - first
+        """Sweep forwards: q ← E (E + U)⁻ᵀ A t, solution += α t, r −= α q in a thread's columns, and their part of
+        r·E⁻¹r."""
+        first = partition(columns, thread, threads)
+        width = partition(columns, thread + 1, threads) - first
         rz = scalar(0.0)
         y_u = scalar(0.0)
         y_v = scalar(0.0)
@@ -150,55 +131,47 @@ def define(variant: Variant) -> SimpleNamespace:
             begin = row * columns + first
             column = int(0)
             while column < width:
-                if strips > 1:
-                    keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
+                if threads > 1:
+                    keep_pace(signals, thread, thread - 1, thread + 1, threads, column, width, swept + row)
                 i = begin + column
-                inverse = at(inverse_pivot, i)
-                t = at(t_x, i)
-                q = at(q_x, i)
+                inverse = load(inverse_pivot, i)
+                t = load(work.t_x, i)
+                q = load(work.q_x, i)
                 if wp.static(sliding):
-                    inverse_u = at(inverse_s, 2 * i)
-                    inverse_v = at(inverse_s, 2 * i + 1)
-                    u = at(t_s, 2 * i)
-                    v = at(t_s, 2 * i + 1)
-                    q_u = at(q_s, 2 * i)
-                    q_v = at(q_s, 2 * i + 1)
+                    inverse_u = load(inverse_s, 2 * i)
+                    inverse_v = load(inverse_s, 2 * i + 1)
+                    u = load(work.t_s, 2 * i)
+                    v = load(work.t_s, 2 * i + 1)
+                    q_u = load(work.q_s, 2 * i)
+                    q_v = load(work.q_s, 2 * i + 1)
                     y_u = inverse_u * q_u - u
                     y_v = inverse_v * q_v - v
-                    put(euler_solution, 2 * i, at(euler_solution, 2 * i) + u * alpha)
-                    put(euler_solution, 2 * i + 1, at(euler_solution, 2 * i + 1) + v * alpha)
-                    r_u = at(r_s, 2 * i) - q_u * alpha
-                    r_v = at(r_s, 2 * i + 1) - q_v * alpha
-                    put(r_s, 2 * i, r_u)
-                    put(r_s, 2 * i + 1, r_v)
+                    store(euler_solution, 2 * i, load(euler_solution, 2 * i) + u * alpha)
+                    store(euler_solution, 2 * i + 1, load(euler_solution, 2 * i + 1) + v * alpha)
+                    r_u = load(work.r_s, 2 * i) - q_u * alpha
+                    r_v = load(work.r_s, 2 * i + 1) - q_v * alpha
+                    store(work.r_s, 2 * i, r_u)
+                    store(work.r_s, 2 * i + 1, r_v)
                     rz += r_u * inverse_u * r_u + r_v * inverse_v * r_v
                 y = product(inverse, q) - t
-                spread(i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, y, y_u, y_v, q_x, q_s)
-                put(solution, i, at(solution, i) + t * alpha)
-                r = at(r_x, i) - q * alpha
-                put(r_x, i, r)
+                subtract_transposed(i, blocks, y, y_u, y_v, work.q_x, work.q_s)
+                store(solution, i, load(solution, i) + t * alpha)
+                r = load(work.r_x, i) - q * alpha
+                store(work.r_x, i, r)
                 rz += wp.dot(r, product(inverse, r))
                 column += 1
-            if strips > 1:
-                ended(team, strip, swept + row + 1)
+            if threads > 1:
+                ended(signals, thread, swept + row + 1)
         return rz
 
     @wp.kernel(module=module, enable_backward=False)
     def incomplete_conjugate_gradient(
-        strip: int,
-        team: wp.array(dtype=int),
+        thread: int,
+        signals: wp.array(dtype=int),
         # matrix
         nodes: int,
         columns: int,
-        stencil: int,
-        neighbour: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         # right-hand side, and when to stop
@@ -209,58 +182,46 @@ def define(variant: Variant) -> SimpleNamespace:
         # start in, solution out
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
-        # work space
-        r_x: wp.array(dtype=vec3),
-        r_s: wp.array(dtype=scalar),
-        p_x: wp.array(dtype=vec3),
-        p_s: wp.array(dtype=scalar),
-        q_x: wp.array(dtype=vec3),
-        q_s: wp.array(dtype=scalar),
-        t_x: wp.array(dtype=vec3),
-        t_s: wp.array(dtype=scalar),
-        sums: wp.array(dtype=scalar),
-        # report out
-        iterations: wp.array(dtype=int),
-        residual: wp.array(dtype=scalar),
-        status: wp.array(dtype=int),
+        work: SolverWork,
+        report: SolveReport,
     ):
-        """A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch of one thread a strip.
+        """Solve A · solution = rhs, to √(r·E⁻¹r) ≤ tolerance times its start, in one launch a thread.
 
-        Strip 0 solves once; others are helpers that wait for one solve after the other until they are sent home.
+        Thread 0 solves once; others are helpers that wait for one solve after the other until they are to end.
         What is held has an E⁻¹ of 0: it keeps its value, and enters the right-hand side through the first residual.
         """
         zero = scalar(0.0)
-        strips = team[3]
-        begin = share(nodes, strip, strips)
-        end = share(nodes, strip + 1, strips)
-        first = share(columns, strip, strips)
-        width = share(columns, strip + 1, strips) - first
+        threads = signals[3]
+        begin = partition(nodes, thread, threads)
+        end = partition(nodes, thread + 1, threads)
+        first = partition(columns, thread, threads)
+        width = partition(columns, thread + 1, threads) - first
         rows = nodes / columns
         number = int(0)
         stays = bool(True)
-        if strip == 0 and strips > 1:
-            call(team)
+        if thread == 0 and threads > 1:
+            begin_solve(signals)
         while stays:
-            if strip == 0:
+            if thread == 0:
                 stays = False
             else:
-                wait_for_call(team, number, strip)
+                wait_for_solve(signals, number, thread)
                 number += 1
-                if team[2] != 0:
+                if signals[2] != 0:
                     break
-            met = team[5] + strips
-            swept = team[16 + 16 * strip]
+            arrived = signals[5] + threads
+            swept = signals[16 + 16 * thread]
             start = zero
             for i in range(begin, end):
-                put(r_x, i, at(rhs, i))
-                put(p_x, i, vec3())
-                start += wp.dot(at(solution, i), at(solution, i))
+                store(work.r_x, i, load(rhs, i))
+                store(work.p_x, i, vec3())
+                start += wp.dot(load(solution, i), load(solution, i))
                 if wp.static(sliding):
                     for s in range(2 * i, 2 * i + 2):
-                        put(r_s, s, at(euler_rhs, s))
-                        put(p_s, s, zero)
-                        start += at(euler_solution, s) * at(euler_solution, s)
-            start = total(start, 0, strip, strips, met, team, sums)
+                        store(work.r_s, s, load(euler_rhs, s))
+                        store(work.p_s, s, zero)
+                        start += load(euler_solution, s) * load(euler_solution, s)
+            start = total(start, 0, thread, threads, arrived, signals, work.sums)
             # r = E (E + U)⁻ᵀ (b − A x)
             rz = zero
             u = zero
@@ -270,46 +231,49 @@ def define(variant: Variant) -> SimpleNamespace:
             for row in range(rows):
                 column = int(0)
                 while column < width:
-                    if strips > 1:
-                        keep_pace(team, strip, strip - 1, strip + 1, strips, column, width, swept + row)
+                    if threads > 1:
+                        keep_pace(signals, thread, thread - 1, thread + 1, threads, column, width, swept + row)
                     i = row * columns + first + column
-                    inverse = at(inverse_pivot, i)
+                    inverse = load(inverse_pivot, i)
                     x = vec3()
-                    r = at(r_x, i)
+                    r = load(work.r_x, i)
                     if start != zero:
-                        x = at(solution, i)
-                        w, w_u, w_v = gather(
-                            i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution
-                        )
-                        r -= w + times(at(diagonal_xx, i), x)
+                        x = load(solution, i)
+                        w, w_u, w_v = upper_product(i, blocks, solution, euler_solution)
+                        r -= w + times(load(blocks.diagonal_xx, i), x)
                         if wp.static(sliding):
-                            u = at(euler_solution, 2 * i)
-                            v = at(euler_solution, 2 * i + 1)
-                            xs_u = at(diagonal_xs, 2 * i)
-                            xs_v = at(diagonal_xs, 2 * i + 1)
+                            u = load(euler_solution, 2 * i)
+                            v = load(euler_solution, 2 * i + 1)
+                            xs_u = load(blocks.diagonal_xs, 2 * i)
+                            xs_v = load(blocks.diagonal_xs, 2 * i + 1)
                             r -= xs_u * u + xs_v * v
-                            r_u = at(r_s, 2 * i) - w_u - wp.dot(xs_u, x) - at(diagonal_ss, 2 * i) * u
-                            r_v = at(r_s, 2 * i + 1) - w_v - wp.dot(xs_v, x) - at(diagonal_ss, 2 * i + 1) * v
-                            put(r_s, 2 * i, r_u)
-                            put(r_s, 2 * i + 1, r_v)
-                        put(r_x, i, r)
+                            r_u = load(work.r_s, 2 * i) - w_u - wp.dot(xs_u, x) - load(blocks.diagonal_ss, 2 * i) * u
+                            r_v = (
+                                load(work.r_s, 2 * i + 1)
+                                - w_v
+                                - wp.dot(xs_v, x)
+                                - load(blocks.diagonal_ss, 2 * i + 1) * v
+                            )
+                            store(work.r_s, 2 * i, r_u)
+                            store(work.r_s, 2 * i + 1, r_v)
+                        store(work.r_x, i, r)
                     y = product(inverse, r)
                     rz += wp.dot(r, y)
                     if wp.static(sliding):
-                        y_u = at(inverse_s, 2 * i) * at(r_s, 2 * i)
-                        y_v = at(inverse_s, 2 * i + 1) * at(r_s, 2 * i + 1)
-                        rz += at(r_s, 2 * i) * y_u + at(r_s, 2 * i + 1) * y_v
+                        y_u = load(inverse_s, 2 * i) * load(work.r_s, 2 * i)
+                        y_v = load(inverse_s, 2 * i + 1) * load(work.r_s, 2 * i + 1)
+                        rz += load(work.r_s, 2 * i) * y_u + load(work.r_s, 2 * i + 1) * y_v
                     # what is held has y = 0 and gives others its x alone
-                    spread(
-                        i, stencil, neighbour, upper_xx, upper_xs, upper_sx, upper_ss,
-                        y + x, y_u + u, y_v + v, r_x, r_s,
+                    subtract_transposed(
+                        i, blocks,
+                        y + x, y_u + u, y_v + v, work.r_x, work.r_s,
                     )  # fmt: skip
                     column += 1
-                if strips > 1:
-                    ended(team, strip, swept + row + 1)
+                if threads > 1:
+                    ended(signals, thread, swept + row + 1)
             swept += rows
-            rz = total(rz, 1, strip, strips, met + strips, team, sums)
-            met += strips
+            rz = total(rz, 1, thread, threads, arrived + threads, signals, work.sums)
+            arrived += threads
             size = rz
 
             limit = tolerance[0] * tolerance[0] * size
@@ -317,36 +281,34 @@ def define(variant: Variant) -> SimpleNamespace:
             beta = zero
             while count < most_iterations and rz > limit:
                 curvature = backward_sweep(
-                    strip, strips, swept, team, nodes, columns, stencil, neighbour,
-                    diagonal_xx, diagonal_xs, diagonal_ss, upper_xx, upper_xs, upper_sx, upper_ss,
-                    inverse_pivot, inverse_s, beta, r_x, r_s, p_x, p_s, t_x, t_s, q_x, q_s,
+                    thread, threads, swept, signals, nodes, columns, blocks,
+                    inverse_pivot, inverse_s, beta, work,
                 )  # fmt: skip
-                curvature = total(curvature, 3, strip, strips, met + strips, team, sums)
+                curvature = total(curvature, 3, thread, threads, arrived + threads, signals, work.sums)
                 swept += rows
-                met += strips
+                arrived += threads
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break
                 rz_next = forward_sweep(
-                    strip, strips, swept, team, nodes, columns, stencil, neighbour,
-                    upper_xx, upper_xs, upper_sx, upper_ss, inverse_pivot, inverse_s,
-                    rz / curvature, t_x, t_s, q_x, q_s, solution, euler_solution, r_x, r_s,
+                    thread, threads, swept, signals, nodes, columns, blocks, inverse_pivot, inverse_s,
+                    rz / curvature, work, solution, euler_solution,
                 )  # fmt: skip
-                rz_next = total(rz_next, 4, strip, strips, met + strips, team, sums)
+                rz_next = total(rz_next, 4, thread, threads, arrived + threads, signals, work.sums)
                 swept += rows
-                met += strips
+                arrived += threads
                 beta = rz_next / rz
                 rz = rz_next
                 count += 1
-            if strips > 1:
-                meet(team, met + strips)
-            if strip == 0:
-                if report(count, rz, size, limit, iterations, residual, status):
+            if threads > 1:
+                barrier(signals, arrived + threads)
+            if thread == 0:
+                if write_report(count, rz, size, limit, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
-                        here = wp.dot(at(r_x, i), product(at(inverse_pivot, i), at(r_x, i)))
+                        here = wp.dot(load(work.r_x, i), product(load(inverse_pivot, i), load(work.r_x, i)))
                         if not (here <= worst):
                             worst = here
-                            status[1] = i
+                            report.status[1] = i
 
     return SimpleNamespace(incomplete_conjugate_gradient=incomplete_conjugate_gradient)

@@ -18,7 +18,7 @@ import warp as wp
 from ..core import memory
 from ..core.variant import Variant
 
-_CORRECT = """
+_CORRECT_PIVOTS = """
     for (int slot = 0; slot < stencil; ++slot) {
         const int j = neighbour.data[stencil * i + slot];
         if (j >= 0) {
@@ -51,24 +51,24 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def product(m: sym33, x: vec3) -> vec3:
-        """m x."""
+        """Compute m x."""
         return vec3(
             m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
             m[1] * x[0] + m[3] * x[1] + m[4] * x[2],
             m[2] * x[0] + m[4] * x[1] + m[5] * x[2],
         )
 
-    @wp.func_native(memory.rows(variant, _CORRECT))
-    def correct(
+    @wp.func_native(memory.rows(variant, _CORRECT_PIVOTS))
+    def correct_pivots(
         m: sym33, i: int, stencil: int, neighbour: wp.array(dtype=int), upper_xx: wp.array(dtype=mat33),
         pivot: wp.array(dtype=sym33),
     ):  # fmt: skip
-        """pivot −= bᵀ m b of the neighbours of a node, b its blocks."""
+        """Correct pivots, pivot −= bᵀ m b of the neighbours of a node, b its blocks."""
         ...
 
     @wp.func
     def inverse_of(m: sym33) -> sym33:
-        """Inverse of a positive definite matrix; 0 where it is not safely so."""
+        """Invert a positive definite matrix; 0 where it is not safely so."""
         c00 = m[3] * m[5] - m[4] * m[4]
         c01 = m[2] * m[4] - m[1] * m[5]
         c02 = m[1] * m[4] - m[2] * m[3]
@@ -82,14 +82,14 @@ def functions(variant: Variant) -> SimpleNamespace:
             return sym33(c00 * f, c01 * f, c02 * f, c11 * f, c12 * f, c22 * f)
         return sym33()
 
-    return SimpleNamespace(symmetric=symmetric, product=product, correct=correct, inverse_of=inverse_of)
+    return SimpleNamespace(symmetric=symmetric, product=product, correct_pivots=correct_pivots, inverse_of=inverse_of)
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, mat33, sym33 = variant.scalar, variant.mat33, variant.sym33
-    at, put = memory.functions(variant).at, memory.functions(variant).put
-    symmetric, correct = functions(variant).symmetric, functions(variant).correct
+    load, store = memory.functions(variant).load, memory.functions(variant).store
+    symmetric, correct_pivots = functions(variant).symmetric, functions(variant).correct_pivots
     inverse_of = functions(variant).inverse_of
     variant.fuse("incomplete")
 
@@ -103,21 +103,21 @@ def define(variant: Variant) -> SimpleNamespace:
         upper_xx: wp.array(dtype=mat33),
         inverse_pivot: wp.array(dtype=sym33),
     ):
-        """E⁻¹ of the positions, E being added up in its place; 0 for what is held, which keeps it out.
+        """Compute E⁻¹ of the positions, E being added up in its place; 0 for what is held, which keeps it out.
 
         Sliding coordinates keep their diagonal: friction's damping dominates it, and their share of E changes the
         iterations by less than one.
         """
         for i in range(nodes):
-            put(inverse_pivot, i, symmetric(at(diagonal_xx, i)))
+            store(inverse_pivot, i, symmetric(load(diagonal_xx, i)))
         for i in range(nodes):
             inverse = sym33()
             if is_free[i] != 0:
-                inverse = inverse_of(at(inverse_pivot, i))
+                inverse = inverse_of(load(inverse_pivot, i))
                 if inverse[0] <= scalar(0.0):
                     # What was dropped made it indefinite: any positive definite E will do, so take the block itself.
                     inverse = symmetric(wp.inverse(diagonal_xx[i]))
-                correct(inverse, i, stencil, neighbour, upper_xx, inverse_pivot)
-            put(inverse_pivot, i, inverse)
+                correct_pivots(inverse, i, stencil, neighbour, upper_xx, inverse_pivot)
+            store(inverse_pivot, i, inverse)
 
     return SimpleNamespace(factorize=factorize)

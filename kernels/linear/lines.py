@@ -24,10 +24,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core import memory
+from ..core.structs import structs
 from ..core.variant import Variant
-
-BLOCKS = 11
-"""Matrix blocks of a coarse node: its own, and those of its ten upper neighbours (``description/levels.py``)."""
 
 _FACTORIZE = """
     // K unknowns a node: three of its position, and where yarns slide the rate along this yarn
@@ -171,41 +169,41 @@ _FETCH_NODES = """
     auto diagonal = [&](int i, block& m) {
         for (int k = 0; k < 3; ++k)
             for (int j = 0; j < 3; ++j)
-                m[k][j] = diagonal_xx.data[i].data[k][j];
+                m[k][j] = blocks.diagonal_xx.data[i].data[k][j];
 #if SLIDING
         for (int k = 0; k < 3; ++k)
-            m[k][3] = m[3][k] = diagonal_xs.data[2 * i + direction].c[k];
-        m[3][3] = diagonal_ss.data[2 * i + direction];
+            m[k][3] = m[3][k] = blocks.diagonal_xs.data[2 * i + direction].c[k];
+        m[3][3] = blocks.diagonal_ss.data[2 * i + direction];
 #endif
     };
     auto upper = [&](int i, int slot, block& m) {
-        if (slot >= stencil || neighbour.data[stencil * i + slot] < 0) {
+        if (slot >= blocks.stencil || blocks.neighbour.data[blocks.stencil * i + slot] < 0) {
             clear(m);
             return;
         }
         for (int k = 0; k < 3; ++k)
             for (int j = 0; j < 3; ++j)
-                m[k][j] = upper_xx.data[stencil * i + slot].data[k][j];
+                m[k][j] = blocks.upper_xx.data[blocks.stencil * i + slot].data[k][j];
 #if SLIDING
         for (int k = 0; k < 3; ++k) {
-            m[k][3] = upper_xs.data[4 * i + slot].c[k];
-            m[3][k] = upper_sx.data[4 * i + slot].c[k];
+            m[k][3] = blocks.upper_xs.data[4 * i + slot].c[k];
+            m[3][k] = blocks.upper_sx.data[4 * i + slot].c[k];
         }
-        m[3][3] = upper_ss.data[4 * i + slot];
+        m[3][3] = blocks.upper_ss.data[4 * i + slot];
 #endif
     };
 """
 _FETCH_COARSE = """
     auto is_free = [&](int i, SCALAR* free) {
-        free[0] = free[1] = free[2] = coarse_block.data[11 * i].data[0][0] > 0;
+        free[0] = free[1] = free[2] = coarse_block.data[blocks_per_node * i].data[0][0] > 0;
     };
     auto fetch = [&](int at, block& m) {
         for (int k = 0; k < 3; ++k)
             for (int j = 0; j < 3; ++j)
                 m[k][j] = coarse_block.data[at].data[k][j];
     };
-    auto diagonal = [&](int i, block& m) { fetch(11 * i, m); };
-    auto upper = [&](int i, int slot, block& m) { fetch(11 * i + 1 + slot, m); };
+    auto diagonal = [&](int i, block& m) { fetch(blocks_per_node * i, m); };
+    auto upper = [&](int i, int slot, block& m) { fetch(blocks_per_node * i + 1 + slot, m); };
 """
 _SOLVE = """
     auto vector = [&](int i) {
@@ -272,9 +270,11 @@ def _snippet(variant: Variant, text: str, unknowns: int) -> str:
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """Factorize or solve one line: ``nodes`` of the cloth, with rates where yarns slide, or ``coarse`` ones."""
+    """Make what factorizes or solves one line: ``nodes`` of the cloth, with rates where yarns slide, or ``coarse``
+    ones."""
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
     unknowns = 4 if variant.sliding else 3
+    BlockMatrix = structs(variant).BlockMatrix
 
     @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns))
     def factorize_nodes(
@@ -282,17 +282,9 @@ def functions(variant: Variant) -> SimpleNamespace:
         begin: int,
         end: int,
         node: wp.array(dtype=int),
-        stencil: int,
-        neighbour: wp.array(dtype=int),
+        blocks: BlockMatrix,
         is_free_x: wp.array(dtype=int),
         is_crossing: wp.array(dtype=int),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
         factor: wp.array(dtype=scalar),
         halves: wp.array(dtype=sym33),
     ):
@@ -305,6 +297,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         begin: int,
         end: int,
         node: wp.array(dtype=int),
+        blocks_per_node: int,
         coarse_block: wp.array(dtype=mat33),
         factor: wp.array(dtype=scalar),
         halves: wp.array(dtype=sym33),
@@ -325,7 +318,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         z_x: wp.array(dtype=vec3),
         z_s: wp.array(dtype=scalar),
     ):
-        """z += L⁻¹ r of a line of the cloth; of rates z = L⁻¹ r, each of which is on one line alone."""
+        """Add up z += L⁻¹ r of a line of the cloth; of rates z = L⁻¹ r, each of which is on one line alone."""
         ...
 
     @wp.func_native(_snippet(variant, _SOLVE, 3))
@@ -339,7 +332,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         r_x: wp.array(dtype=vec3),
         z_x: wp.array(dtype=vec3),
     ):
-        """z += L⁻¹ r of a line of a coarse level."""
+        """Add up z += L⁻¹ r of a line of a coarse level."""
         ...
 
     return SimpleNamespace(

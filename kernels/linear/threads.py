@@ -1,15 +1,15 @@
-"""Processor cores that share a linear solve, each with a strip of the cloth's columns.
+"""Threads that share a linear solve, each with its part of the cloth's columns, on a processor core of its own.
 
-A sweep goes along the rows, one after the other, and a strip follows its neighbours: forwards, it begins a row when the
-strip before has ended it, and ends it when the strip behind has begun the last one, by ``EDGE`` nodes; backwards the
-other way round. So they all work, a row or two apart, and what they compute is what one core does. They run one kernel
-at the same time, and ``team`` is where they meet:
+A sweep goes along the rows, one after the other, and a thread follows its neighbours: forwards, it begins a row when
+the thread before has ended it, and ends it when the thread behind has begun the last one, by ``EDGE`` nodes; backwards
+the other way round. So they all work, a row or two apart, and what they compute is what one core does. They run one
+kernel at the same time, and wait for each other by ``signals``:
 
-    team[0] how often strips came to a meeting   team[1] the number of the solve   team[2] 1: helpers are to go home
-    team[3] how many strips                      team[4] the last helper to wait   team[5] team[0] before the solve
-    team[16 + 16 k] rows that strip k has ended, of all sweeps, and team[17 + 16 k] those that it has begun
+    [0] how often threads came to a barrier   [1] the number of the solve       [2] 1: helpers are to end
+    [3] how many threads                      [4] the last helper to wait       [5] [0] before the solve
+    [16 + 16 k] rows that thread k has ended, of all sweeps, and [17 + 16 k] those that it has begun
 
-A GPU has one strip and never waits.
+A GPU has one thread and never waits.
 """
 
 import functools
@@ -20,115 +20,115 @@ import warp as wp
 from ..core.variant import Variant
 
 EDGE = 3
-"""Nodes of a row that share neighbours with the next strip: the matrix couples second next ones."""
+"""Nodes of a row that share neighbours with the next thread: the matrix couples second next ones."""
 
-_MEET = """
+_BARRIER = """
 #if !defined(__CUDA_ARCH__)
-    __atomic_add_fetch(&team.data[0], 1, __ATOMIC_ACQ_REL);
-    while (__atomic_load_n(&team.data[0], __ATOMIC_ACQUIRE) < goal) {}
+    __atomic_add_fetch(&signals.data[0], 1, __ATOMIC_ACQ_REL);
+    while (__atomic_load_n(&signals.data[0], __ATOMIC_ACQUIRE) < goal) {}
 #endif
 """
-_CALL = """
+_BEGIN = """
 #if !defined(__CUDA_ARCH__)
-    team.data[5] = __atomic_load_n(&team.data[0], __ATOMIC_ACQUIRE);
-    __atomic_add_fetch(&team.data[1], 1, __ATOMIC_ACQ_REL);
+    signals.data[5] = __atomic_load_n(&signals.data[0], __ATOMIC_ACQUIRE);
+    __atomic_add_fetch(&signals.data[1], 1, __ATOMIC_ACQ_REL);
 #endif
 """
 _AWAIT = """
 #if !defined(__CUDA_ARCH__)
-    __atomic_store_n(&team.data[4], strip, __ATOMIC_RELEASE);
-    while (__atomic_load_n(&team.data[1], __ATOMIC_ACQUIRE) == last
-           && !__atomic_load_n(&team.data[2], __ATOMIC_ACQUIRE)) {}
+    __atomic_store_n(&signals.data[4], thread, __ATOMIC_RELEASE);
+    while (__atomic_load_n(&signals.data[1], __ATOMIC_ACQUIRE) == last
+           && !__atomic_load_n(&signals.data[2], __ATOMIC_ACQUIRE)) {}
 #endif
 """
 _ENDED = """
 #if !defined(__CUDA_ARCH__)
-    __atomic_store_n(&team.data[16 + 16 * strip], rows, __ATOMIC_RELEASE);
+    __atomic_store_n(&signals.data[16 + 16 * thread], rows, __ATOMIC_RELEASE);
 #endif
 """
 _BEGUN = """
 #if !defined(__CUDA_ARCH__)
-    __atomic_store_n(&team.data[17 + 16 * strip], rows, __ATOMIC_RELEASE);
+    __atomic_store_n(&signals.data[17 + 16 * thread], rows, __ATOMIC_RELEASE);
 #endif
 """
 _UNTIL_ENDED = """
 #if !defined(__CUDA_ARCH__)
-    while (__atomic_load_n(&team.data[16 + 16 * strip], __ATOMIC_ACQUIRE) < rows) {}
+    while (__atomic_load_n(&signals.data[16 + 16 * thread], __ATOMIC_ACQUIRE) < rows) {}
 #endif
 """
 _UNTIL_BEGUN = """
 #if !defined(__CUDA_ARCH__)
-    while (__atomic_load_n(&team.data[17 + 16 * strip], __ATOMIC_ACQUIRE) < rows) {}
+    while (__atomic_load_n(&signals.data[17 + 16 * thread], __ATOMIC_ACQUIRE) < rows) {}
 #endif
 """
 
 
-@wp.func_native(_CALL)
-def call(team: wp.array(dtype=int)):
+@wp.func_native(_BEGIN)
+def begin_solve(signals: wp.array(dtype=int)):
     """Begins a solve."""
     ...
 
 
 @wp.func_native(_AWAIT)
-def wait_for_call(team: wp.array(dtype=int), last: int, strip: int):
+def wait_for_solve(signals: wp.array(dtype=int), last: int, thread: int):
     """Waits for a solve after the last one, or the end of all."""
     ...
 
 
-@wp.func_native(_MEET)
-def meet(team: wp.array(dtype=int), goal: int):
-    """Comes to a meeting, and waits until so many have come."""
+@wp.func_native(_BARRIER)
+def barrier(signals: wp.array(dtype=int), goal: int):
+    """Comes to a barrier, and waits until so many have come."""
     ...
 
 
 @wp.func_native(_ENDED)
-def ended(team: wp.array(dtype=int), strip: int, rows: int):
-    """Tells the other strips how many rows this one has ended."""
+def ended(signals: wp.array(dtype=int), thread: int, rows: int):
+    """Tells the other threads how many rows this one has ended."""
     ...
 
 
 @wp.func_native(_BEGUN)
-def begun(team: wp.array(dtype=int), strip: int, rows: int):
-    """Tells the other strips in how many rows this one is past its first nodes."""
+def begun(signals: wp.array(dtype=int), thread: int, rows: int):
+    """Tells the other threads in how many rows this one is past its first nodes."""
     ...
 
 
 @wp.func_native(_UNTIL_ENDED)
-def until_ended(team: wp.array(dtype=int), strip: int, rows: int):
-    """Waits until a strip has ended so many rows."""
+def until_ended(signals: wp.array(dtype=int), thread: int, rows: int):
+    """Waits until a thread has ended so many rows."""
     ...
 
 
 @wp.func_native(_UNTIL_BEGUN)
-def until_begun(team: wp.array(dtype=int), strip: int, rows: int):
-    """Waits until a strip is past its first nodes of so many rows."""
+def until_begun(signals: wp.array(dtype=int), thread: int, rows: int):
+    """Waits until a thread is past its first nodes of so many rows."""
     ...
 
 
 @wp.func
-def share(whole: int, strip: int, strips: int) -> int:
-    """Where the share of a strip begins."""
-    return int(wp.int64(whole) * wp.int64(strip) / wp.int64(strips))
+def partition(whole: int, thread: int, threads: int) -> int:
+    """Find where the part of a thread begins."""
+    return int(wp.int64(whole) * wp.int64(thread) / wp.int64(threads))
 
 
 @wp.func
 def keep_pace(
-    team: wp.array(dtype=int), strip: int, before: int, behind: int, strips: int, step: int, width: int, rows: int
+    signals: wp.array(dtype=int), thread: int, before: int, behind: int, threads: int, step: int, width: int, rows: int
 ):
-    """Comes before the step-th node of a row, when a strip has swept so many rows; waits until it may be taken.
+    """Comes before the step-th node of a row, when a thread has swept so many rows; waits until it may be taken.
 
-    The strip before is the one that this one takes up a row from, that behind the one which takes it up.
-    Forwards, the last nodes of a row spread to some that the strip behind spreads to from the first of the row before;
+    The thread before is the one that this one takes up a row from, that behind the one which takes it up.
+    Forwards, the last nodes of a row spread to some that the thread behind spreads to from the first of the row before;
     backwards, they read what it made there. Further on in its row it touches none of theirs, so it may lag by one.
     """
     if step == 0:
-        if before >= 0 and before < strips:
-            until_ended(team, before, rows + 1)
+        if before >= 0 and before < threads:
+            until_ended(signals, before, rows + 1)
     if step == wp.static(EDGE):
-        begun(team, strip, rows + 1)
+        begun(signals, thread, rows + 1)
     if step == width - wp.static(EDGE):
-        if behind >= 0 and behind < strips:
-            until_begun(team, behind, rows)
+        if behind >= 0 and behind < threads:
+            until_begun(signals, behind, rows)
 
 
 @functools.cache
@@ -139,20 +139,20 @@ def functions(variant: Variant) -> SimpleNamespace:
     def total(
         mine: scalar,
         slot: int,
-        strip: int,
-        strips: int,
-        met: int,
-        team: wp.array(dtype=int),
+        thread: int,
+        threads: int,
+        arrived: int,
+        signals: wp.array(dtype=int),
         sums: wp.array(dtype=scalar),
     ) -> scalar:
-        """The sum over the strips, when all have come to it."""
-        if strips == 1:
+        """Add up the sum over the threads, when all have come to it."""
+        if threads == 1:
             return mine
-        sums[strips * slot + strip] = mine
-        meet(team, met)
+        sums[threads * slot + thread] = mine
+        barrier(signals, arrived)
         result = scalar(0.0)
-        for k in range(strips):
-            result += sums[strips * slot + k]
+        for k in range(threads):
+            result += sums[threads * slot + k]
         return result
 
     return SimpleNamespace(total=total)

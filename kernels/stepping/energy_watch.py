@@ -77,14 +77,14 @@ def define(variant: Variant) -> SimpleNamespace:
         velocity: wp.array(dtype=vec3),
         power: wp.array(dtype=scalar),
     ):
-        """Power of outer forces, and what it would be with those at the beginning of the step."""
+        """Add up the power of outer forces, and what it would be with those at the beginning of the step."""
         i = index(wp.tid())
         wp.atomic_add(power, 0, wp.dot(force[i], velocity[i]))
         wp.atomic_add(power, 1, wp.dot(outer_force[i], velocity[i]))
 
     @wp.kernel(module=module, enable_backward=False)
     def keep_outer_force(status: wp.array(dtype=int), force: wp.array(dtype=vec3), outer_force: wp.array(dtype=vec3)):
-        """The forces at the beginning of the next step, if this one is good."""
+        """Keep the forces at the beginning of the next step, if this one is good."""
         i = index(wp.tid())
         if status[0] == 0:
             outer_force[i] = force[i]
@@ -99,7 +99,7 @@ def define(variant: Variant) -> SimpleNamespace:
         position: wp.array(dtype=vec3),
         power: wp.array(dtype=scalar),
     ):
-        """Power of moving pins: the force of their springs times their velocity."""
+        """Add up the power of moving pins: the force of their springs times their velocity."""
         e = index(wp.tid())
         pull = (pin_target[e] - position[index(pin_node[e])]) * pin_stiffness[0]
         of_pin = wp.dot(pull, pin_motion[e]) / step_duration
@@ -113,7 +113,7 @@ def define(variant: Variant) -> SimpleNamespace:
         power: wp.array(dtype=scalar),
         stage_work: wp.array(dtype=scalar),
     ):
-        """Work of a stage's power, which makes its share of the step."""
+        """Add up the work of a stage's power, which makes its share of the step."""
         stage_work[0] += share * step_size[0] * power[0]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -124,7 +124,7 @@ def define(variant: Variant) -> SimpleNamespace:
         alert: wp.array(dtype=int),
         looks_closely: wp.array(dtype=int),
     ):
-        """Whether to add up the other terms too."""
+        """Choose whether to add up the other terms too."""
         exchanged = wp.abs(elastic_energy[0] - bounds[4])
         if exchanged > scalar(SUDDEN) * wp.max(energy[0] + elastic_energy[0], bounds[2]):
             alert[0] = wp.static(ALERT)

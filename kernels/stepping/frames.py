@@ -30,15 +30,17 @@ def define(variant: Variant) -> SimpleNamespace:
             status[2] = counters[0]
 
     @wp.kernel(module=module, enable_backward=False)
-    def take(counters: wp.array(dtype=int), path: wp.array(dtype=vec3), values: wp.array(dtype=vec3)):
-        """This step's row of a path; its last row ever after."""
+    def load_inputs(counters: wp.array(dtype=int), path: wp.array(dtype=vec3), values: wp.array(dtype=vec3)):
+        """Load this step's row of a path; its last row ever after."""
         e = index(wp.tid())
         rows = path.shape[0] / values.shape[0]
         values[e] = path[wp.min(counters[1], rows - 1) * values.shape[0] + e]
 
     @wp.kernel(module=module, enable_backward=False)
-    def give(counters: wp.array(dtype=int), values_grad: wp.array(dtype=vec3), path_grad: wp.array(dtype=vec3)):
-        """Adjoint of ``take``."""
+    def scatter_gradient(
+        counters: wp.array(dtype=int), values_grad: wp.array(dtype=vec3), path_grad: wp.array(dtype=vec3)
+    ):
+        """Reverse ``load_inputs``."""
         e = index(wp.tid())
         rows = path_grad.shape[0] / values_grad.shape[0]
         k = wp.min(counters[1], rows - 1) * values_grad.shape[0] + e
@@ -55,8 +57,8 @@ def define(variant: Variant) -> SimpleNamespace:
         values: wp.array(dtype=vec3),
         motion: wp.array(dtype=vec3),
     ):
-        """Where a path is at the time of a stage, on the straight line from the row before to this step's, which is
-        where the step ends; and how far it goes in the step. The first one begins at the start."""
+        """Find where a path is at the time of a stage, on the straight line from the row before to this step's, which
+        is where the step ends; and how far it goes in the step. The first one begins at the start."""
         e = index(wp.tid())
         count = values.shape[0]
         rows = path.shape[0] / count
@@ -69,14 +71,14 @@ def define(variant: Variant) -> SimpleNamespace:
         motion[e] = after - before
 
     @wp.kernel(module=module, enable_backward=False)
-    def give_back_along(
+    def scatter_gradient_along(
         counters: wp.array(dtype=int),
         stage: int,
         stage_times: wp.array(dtype=scalar),
         values_grad: wp.array(dtype=vec3),
         path_grad: wp.array(dtype=vec3),
     ):
-        """Adjoint of ``move_along``."""
+        """Reverse ``move_along``."""
         e = index(wp.tid())
         count = values_grad.shape[0]
         rows = path_grad.shape[0] / count
@@ -116,7 +118,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     frame_anchor[2 * k + d] = anchor[2 * i + d]
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall(
+    def restore_frame(
         nodes: int,
         counters: wp.array(dtype=int),
         frame_position: wp.array(dtype=vec3),
@@ -133,7 +135,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_solution: wp.array(dtype=scalar),
         euler_next: wp.array(dtype=scalar),
     ):
-        """The state that a step started from, and what the step made of it."""
+        """Restore the state that a step started from, and what the step made of it."""
         i = index(wp.tid())
         k = index(counters[0] * nodes + i)
         next = k + nodes
@@ -151,7 +153,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     anchor[s] = frame_anchor[2 * k + d]
 
     @wp.kernel(module=module, enable_backward=False)
-    def receive(
+    def add_loss_gradient(
         nodes: int,
         counters: wp.array(dtype=int),
         frame_position_grad: wp.array(dtype=vec3),
@@ -180,11 +182,11 @@ def define(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         count=count,
-        take=take,
-        give=give,
+        load_inputs=load_inputs,
+        scatter_gradient=scatter_gradient,
         move_along=move_along,
-        give_back_along=give_back_along,
+        scatter_gradient_along=scatter_gradient_along,
         record=record,
-        recall=recall,
-        receive=receive,
+        restore_frame=restore_frame,
+        add_loss_gradient=add_loss_gradient,
     )

@@ -10,14 +10,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import coordinates, index
-from ..core.status import NOT_FINITE, ORDER_LOST
+from ..core.indexing import ends, index
+from ..core.status import NOT_FINITE, ORDER_LOST, fail
 from ..core.variant import Variant
 
 
 @functools.cache
 def define_reversible(variant: Variant) -> SimpleNamespace:
-    """What the adjoint runs in reverse."""
+    """Define what the adjoint runs in reverse."""
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
 
     @variant.kernel("terms")
@@ -42,19 +42,19 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
                 euler_rhs[s] = f * step_size[0] + euler_momentum[s]
 
     @variant.kernel("terms")
-    def prescribe(
+    def set_pin_velocity(
         pin_node: wp.array(dtype=int),
         pin_target: wp.array(dtype=vec3),
         remaining: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         solution: wp.array(dtype=vec3),
     ):
-        """The velocity that brings an exact pin to its target within the step, or what is left of it."""
+        """Set the velocity that brings an exact pin to its target within the step, or what is left of it."""
         e = index(wp.tid())
         i = index(pin_node[e])
         solution[i] = (pin_target[e] - position[i]) / remaining[0]
 
-    return SimpleNamespace(right_hand_side=right_hand_side, prescribe=prescribe)
+    return SimpleNamespace(right_hand_side=right_hand_side, set_pin_velocity=set_pin_velocity)
 
 
 @functools.cache
@@ -71,7 +71,8 @@ def define(variant: Variant) -> SimpleNamespace:
         inverse_x: wp.array(dtype=vec3),
         inverse_s: wp.array(dtype=scalar),
     ):
-        """Jacobi: the inverse of the diagonal, and 0 for what does not move, which keeps it out of the iteration."""
+        """Compute Jacobi's preconditioner: the inverse of the diagonal, and 0 for what does not move, which keeps it
+        out of the iteration."""
         i = index(wp.tid())
         one = scalar(1.0)
         if is_free[i] != 0:
@@ -98,7 +99,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """q⁺ = q + h q̇⁺, and whether it is finite."""
+        """Advance to q⁺ = q + h q̇⁺, and whether it is finite."""
         i = index(wp.tid())
         h = step_size[0]
         v = solution[i]
@@ -115,23 +116,18 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler[s] = u
                 finite = finite and wp.isfinite(u)
         if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_order(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         euler: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """Δs > 0: crossings keep their order along a yarn."""
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        """Check that Δs > 0: crossings keep their order along a yarn."""
+        a, _b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
         if euler[sb] <= euler[sa]:
-            if wp.atomic_cas(status, 0, 0, wp.static(ORDER_LOST)) == 0:
-                status[1] = segment_nodes[e][0]
+            fail(status, wp.static(ORDER_LOST), a)
 
     @wp.kernel(module=module, enable_backward=False)
     def copy_vectors(source: wp.array(dtype=vec3), target: wp.array(dtype=vec3)):

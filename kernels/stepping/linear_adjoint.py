@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.status import NOT_FINITE
+from ..core.status import NOT_FINITE, fail
 from ..core.variant import Variant
 
 
@@ -29,18 +29,18 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_grad: wp.array(dtype=scalar),
         velocity_grad: wp.array(dtype=vec3),
         euler_velocity_grad: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         rhs_grad: wp.array(dtype=vec3),
         euler_rhs_grad: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """The right-hand side q̄̇⁺ + h q̄⁺; λ starts at 0. The adjoint of the old velocity starts at 0 as well."""
+        """Compute the right-hand side q̄̇⁺ + h q̄⁺; λ starts at 0. The adjoint of the old velocity starts at 0 as well."""
         i = wp.tid()
         h = step_size[0]
         v = velocity_grad[i] + position_grad[i] * h
         finite = wp.isfinite(v)
-        seed[i] = v
+        adjoint_rhs[i] = v
         velocity_grad[i] = vec3()
         rhs_grad[i] = vec3()
         if wp.static(sliding):
@@ -48,12 +48,11 @@ def define(variant: Variant) -> SimpleNamespace:
                 s = 2 * i + d
                 rate = euler_velocity_grad[s] + euler_grad[s] * h
                 finite = finite and wp.isfinite(rate)
-                euler_seed[s] = rate
+                euler_adjoint_rhs[s] = rate
                 euler_velocity_grad[s] = scalar(0.0)
                 euler_rhs_grad[s] = scalar(0.0)
         if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def matrix_adjoint(
@@ -71,7 +70,7 @@ def define(variant: Variant) -> SimpleNamespace:
         upper_sx_grad: wp.array(dtype=vec3),
         upper_ss_grad: wp.array(dtype=scalar),
     ):
-        """Ā = −λ wᵀ on the blocks that are stored; a block above the diagonal stands for its mirror too."""
+        """Compute Ā = −λ wᵀ on the blocks that are stored; a block above the diagonal stands for its mirror too."""
         i = wp.tid()
         w = solution[i]
         minus = -rhs_grad[i]
@@ -101,16 +100,18 @@ def define(variant: Variant) -> SimpleNamespace:
                             upper_ss_grad[k] = minus_s * w_j + w_s * minus_j
 
     @wp.kernel(module=module, enable_backward=False)
-    def held_adjoint(
+    def hard_pin_adjoint(
         pin_node: wp.array(dtype=int),
-        seed: wp.array(dtype=vec3),
+        adjoint_rhs: wp.array(dtype=vec3),
         q_x: wp.array(dtype=vec3),
         solution_grad: wp.array(dtype=vec3),
     ):
-        """Adjoint of an exact pin's velocity: its row of seed − A λ, with q = A λ."""
+        """Add up the adjoint of an exact pin's velocity: its row of adjoint_rhs − A λ, with q = A λ."""
         i = pin_node[wp.tid()]
-        solution_grad[i] = solution_grad[i] + seed[i] - q_x[i]
+        solution_grad[i] = solution_grad[i] + adjoint_rhs[i] - q_x[i]
 
     return SimpleNamespace(
-        adjoint_right_hand_side=adjoint_right_hand_side, matrix_adjoint=matrix_adjoint, held_adjoint=held_adjoint
+        adjoint_right_hand_side=adjoint_right_hand_side,
+        matrix_adjoint=matrix_adjoint,
+        hard_pin_adjoint=hard_pin_adjoint,
     )

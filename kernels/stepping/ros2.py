@@ -12,7 +12,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.status import NOT_FINITE
+from ..core.status import NOT_FINITE, fail
+from ..core.structs import structs
 from ..core.variant import Variant
 
 GAMMA = 1.0 - 0.5**0.5
@@ -20,24 +21,24 @@ GAMMA = 1.0 - 0.5**0.5
 
 @functools.cache
 def define_reversible(variant: Variant) -> SimpleNamespace:
-    """What the adjoint runs in reverse."""
+    """Define what the adjoint runs in reverse."""
     scalar, vec3 = variant.scalar, variant.vec3
 
     @variant.kernel("ros2")
     def second_stage_damping(
         crossing_node: wp.array(dtype=int),
         friction_damping: wp.array(dtype=scalar),
-        weights: wp.array(dtype=vec3),
+        coefficients: wp.array(dtype=vec3),
         euler_velocity: wp.array(dtype=scalar),
         euler_first_solution: wp.array(dtype=scalar),
         euler_rhs: wp.array(dtype=scalar),
     ):
-        """η D (v₂ − 2 w₁) of friction."""
+        """Add η D (v₂ − 2 w₁) of friction."""
         i = crossing_node[wp.tid()]
         for direction in range(2):
             s = 2 * i + direction
             rate = euler_velocity[s] - scalar(2.0) * euler_first_solution[s]
-            wp.atomic_add(euler_rhs, s, weights[0][1] * friction_damping[0] * rate)
+            wp.atomic_add(euler_rhs, s, coefficients[0][1] * friction_damping[0] * rate)
 
     return SimpleNamespace(second_stage_damping=second_stage_damping)
 
@@ -45,13 +46,8 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    StateAdjoint = structs(variant).StateAdjoint
     module = variant.module("ros2")
-
-    @wp.func
-    def note(finite: bool, i: int, status: wp.array(dtype=int)):
-        if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
 
     @wp.kernel(module=module, enable_backward=False)
     def enter_second_stage(
@@ -68,7 +64,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_start: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """q₂ = q + h w₁, v₂ = q̇ + (w₁ − q̇)/γ and v₂ − 4 w₁ + 2 q̇, whose momentum the second stage has.
+        """Place q₂ = q + h w₁, v₂ = q̇ + (w₁ − q̇)/γ and v₂ − 4 w₁ + 2 q̇, whose momentum the second stage has.
 
         The solve for w₂, if there is to be one, starts from −w₁: from there a step at a constant velocity takes it
         nowhere. It is w₂ of what is held, too, which so arrives where w₁ alone would bring it.
@@ -99,7 +95,8 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_increment[s] = v2_s - w_s * scalar(4.0) + v_s * scalar(2.0)
                 if euler_start:
                     euler_start[s] = -w_s
-        note(finite, i, status)
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def leave_second_stage(
@@ -114,7 +111,7 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """q⁺ and q̇⁺, and whether they are finite."""
+        """Compute q⁺ and q̇⁺, and whether they are finite."""
         i = wp.tid()
         half = scalar(0.5) * step_size[0]
         rate = scalar(wp.static(0.5 / GAMMA))
@@ -133,10 +130,11 @@ def define(variant: Variant) -> SimpleNamespace:
                 finite = finite and wp.isfinite(u)
                 euler[s] = u
                 euler_velocity[s] = w_s + both_s * rate
-        note(finite, i, status)
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall_both_stages(
+    def restore_both_stages(
         nodes: int,
         counters: wp.array(dtype=int),
         step_size: wp.array(dtype=scalar),
@@ -150,7 +148,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first_solution: wp.array(dtype=vec3),
         euler_first_solution: wp.array(dtype=scalar),
     ):
-        """w₁ and w₂ of a step that led from q to q⁺ and q̇⁺, which ``recall`` left in the solution.
+        """Compute w₁ and w₂ of a step that led from q to q⁺ and q̇⁺, which ``restore_frame`` left in the solution.
 
         With a = (q⁺ − q)/h, w₁ + w₂ = 2γ (q̇⁺ − a)/(1 − γ) and w₁ = a − ½ (w₁ + w₂).
         """
@@ -185,20 +183,21 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity_grad: wp.array(dtype=scalar),
         stage_adjoint: wp.array(dtype=vec3),
         euler_stage_adjoint: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         rhs_grad: wp.array(dtype=vec3),
         euler_rhs_grad: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """The right-hand side w̄₂ = ½ h q̄⁺ + q̄̇⁺/(2γ), and w̄₁ = w̄₂ + q̄̇⁺ of the step's end; λ and v̄₂ start at 0."""
+        """Compute the right-hand side w̄₂ = ½ h q̄⁺ + q̄̇⁺/(2γ), and w̄₁ = w̄₂ + q̄̇⁺ of the step's end; λ and v̄₂
+        start at 0."""
         i = wp.tid()
         half = scalar(0.5) * step_size[0]
         rate = scalar(wp.static(0.5 / GAMMA))
         v = velocity_grad[i]
         w2 = position_grad[i] * half + v * rate
         finite = wp.isfinite(w2)
-        seed[i] = w2
+        adjoint_rhs[i] = w2
         stage_adjoint[i] = w2 + v
         velocity_grad[i] = vec3()
         rhs_grad[i] = vec3()
@@ -208,37 +207,29 @@ def define(variant: Variant) -> SimpleNamespace:
                 v_s = euler_velocity_grad[s]
                 w2_s = euler_grad[s] * half + v_s * rate
                 finite = finite and wp.isfinite(w2_s)
-                euler_seed[s] = w2_s
+                euler_adjoint_rhs[s] = w2_s
                 euler_stage_adjoint[s] = w2_s + v_s
                 euler_velocity_grad[s] = scalar(0.0)
                 euler_rhs_grad[s] = scalar(0.0)
-        note(finite, i, status)
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
     def first_stage_adjoint(
         step_size: wp.array(dtype=scalar),
         is_free: wp.array(dtype=int),
-        first_solution: wp.array(dtype=vec3),
-        euler_first_solution: wp.array(dtype=scalar),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-        position_grad: wp.array(dtype=vec3),
-        euler_grad: wp.array(dtype=scalar),
-        velocity_grad: wp.array(dtype=vec3),
-        euler_velocity_grad: wp.array(dtype=scalar),
+        adjoint: StateAdjoint,
         increment_grad: wp.array(dtype=vec3),
         euler_increment_grad: wp.array(dtype=scalar),
         euler_first_solution_grad: wp.array(dtype=scalar),
         solution_grad: wp.array(dtype=vec3),
         stage_adjoint: wp.array(dtype=vec3),
         euler_stage_adjoint: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
-        rhs_grad: wp.array(dtype=vec3),
-        euler_rhs_grad: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """``enter_second_stage`` in reverse: the right-hand side w̄₁, with all of it, and v̄; λ starts at 0.
+        """Reverse ``enter_second_stage``: the right-hand side w̄₁, with all of it, and v̄.
 
         q̄ is what q̄₂ is. w₂ of what is held is −w₁.
         """
@@ -247,33 +238,30 @@ def define(variant: Variant) -> SimpleNamespace:
         rate = scalar(wp.static(1.0 / GAMMA))
         one, two, four = scalar(1.0), scalar(2.0), scalar(4.0)
         m = increment_grad[i]
-        v2 = velocity_grad[i] + m
-        w1 = stage_adjoint[i] + position_grad[i] * h + v2 * rate - m * four
+        v2 = adjoint.velocity_grad[i] + m
+        w1 = stage_adjoint[i] + adjoint.position_grad[i] * h + v2 * rate - m * four
         if is_free[i] == 0:
             w1 -= solution_grad[i]
         finite = wp.isfinite(w1)
-        seed[i] = w1
-        velocity_grad[i] = v2 * (one - rate) + m * two
-        rhs_grad[i] = vec3()
-        solution[i] = first_solution[i]
+        adjoint_rhs[i] = w1
+        adjoint.velocity_grad[i] = v2 * (one - rate) + m * two
         if wp.static(sliding):
             for d in range(2):
                 s = 2 * i + d
                 m_s = euler_increment_grad[s]
-                v2_s = euler_velocity_grad[s] + m_s
-                w1_s = euler_stage_adjoint[s] + euler_grad[s] * h + v2_s * rate - m_s * four
+                v2_s = adjoint.euler_velocity_grad[s] + m_s
+                w1_s = euler_stage_adjoint[s] + adjoint.euler_grad[s] * h + v2_s * rate - m_s * four
                 w1_s += euler_first_solution_grad[s]
                 finite = finite and wp.isfinite(w1_s)
-                euler_seed[s] = w1_s
-                euler_velocity_grad[s] = v2_s * (one - rate) + m_s * two
-                euler_rhs_grad[s] = scalar(0.0)
-                euler_solution[s] = euler_first_solution[s]
-        note(finite, i, status)
+                euler_adjoint_rhs[s] = w1_s
+                adjoint.euler_velocity_grad[s] = v2_s * (one - rate) + m_s * two
+        if not finite:
+            fail(status, wp.static(NOT_FINITE), i)
 
     return SimpleNamespace(
         enter_second_stage=enter_second_stage,
         leave_second_stage=leave_second_stage,
-        recall_both_stages=recall_both_stages,
+        restore_both_stages=restore_both_stages,
         second_stage_adjoint=second_stage_adjoint,
         first_stage_adjoint=first_stage_adjoint,
     )

@@ -11,19 +11,19 @@ import warp as wp
 
 from ..core.indexing import index
 from ..core.memory import functions as access
-from ..core.status import NOT_FINITE
+from ..core.status import NOT_FINITE, fail
 from ..core.variant import Variant
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    """The kernels of ``StageMethod.retreat``, by name."""
+    """Define the kernels of ``StageMethod.backward_step``, by name."""
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
-    at = access(variant).at
+    load = access(variant).load
     module = variant.module("stage_adjoint")
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall_first_stage(
+    def restore_first_stage(
         nodes: int,
         counters: wp.array(dtype=int),
         stage_size: wp.array(dtype=scalar),
@@ -38,7 +38,7 @@ def define(variant: Variant) -> SimpleNamespace:
         first_solution: wp.array(dtype=vec3),
         euler_first_solution: wp.array(dtype=scalar),
     ):
-        """w of the first stage, from q⁺ = q₀ + t w₁ + η w₂; what is held has one velocity in both."""
+        """Compute w of the first stage, from q⁺ = q₀ + t w₁ + η w₂; what is held has one velocity in both."""
         i = index(wp.tid())
         k = (counters[0] + 1) * nodes + i
         w = solution[i]
@@ -52,14 +52,14 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_first_solution[s] = moved / carried_time[0]
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall_carried_stage(
+    def restore_carried_stage(
         carried_rate: wp.array(dtype=scalar),
         velocity: wp.array(dtype=vec3),
         euler_velocity: wp.array(dtype=scalar),
         solution: wp.array(dtype=vec3),
         euler_solution: wp.array(dtype=scalar),
     ):
-        """w of a stage that was carried to the step's end, from q̇⁺ = q̇ + k (w − q̇)."""
+        """Compute w of a stage that was carried to the step's end, from q̇⁺ = q̇ + k (w − q̇)."""
         i = index(wp.tid())
         solution[i] = velocity[i] + (solution[i] - velocity[i]) / carried_rate[0]
         if wp.static(sliding):
@@ -77,7 +77,7 @@ def define(variant: Variant) -> SimpleNamespace:
         stage_adjoint: wp.array(dtype=vec3),
         euler_stage_adjoint: wp.array(dtype=scalar),
     ):
-        """Adjoint of q₀ + t w and v₀ + k (w − v₀): w̄ gains, and v̄₀ keeps 1 − k of itself.
+        """Reverse q₀ + t w and v₀ + k (w − v₀): w̄ gains, and v̄₀ keeps 1 − k of itself.
 
         The end of a step, q⁺ = q₀ + η w and q̇⁺ = w, is t = η and k = 1.
         """
@@ -103,62 +103,61 @@ def define(variant: Variant) -> SimpleNamespace:
         euler_velocity_grad: wp.array(dtype=scalar),
         increment_grad: wp.array(dtype=vec3),
         euler_increment_grad: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
     ):
-        """ρ = w̄ + (∂r/∂w)ᵀ λ, from what reverse mode has gathered."""
+        """Compute ρ = w̄ + (∂r/∂w)ᵀ λ, from what reverse mode has gathered."""
         i = index(wp.tid())
         r = stage_adjoint[i] + position_grad[i] * stage_size[0] + velocity_grad[i] - increment_grad[i]
         finite = wp.isfinite(r)
-        seed[i] = r
+        adjoint_rhs[i] = r
         if wp.static(sliding):
             for d in range(2):
                 s = 2 * i + d
                 r_s = euler_stage_adjoint[s] + euler_grad[s] * stage_size[0] + euler_velocity_grad[s]
                 r_s -= euler_increment_grad[s]
                 finite = finite and wp.isfinite(r_s)
-                euler_seed[s] = r_s
+                euler_adjoint_rhs[s] = r_s
         if not finite:
-            if wp.atomic_cas(status, 0, 0, wp.static(NOT_FINITE)) == 0:
-                status[1] = i
+            fail(status, wp.static(NOT_FINITE), i)
 
     @wp.kernel(module=module, enable_backward=False)
-    def judge_adjoint(
+    def control_adjoint(
         nodes: int,
         inverse_x: wp.array(dtype=vec3),
         inverse_s: wp.array(dtype=scalar),
-        seed: wp.array(dtype=vec3),
-        euler_seed: wp.array(dtype=scalar),
+        adjoint_rhs: wp.array(dtype=vec3),
+        euler_adjoint_rhs: wp.array(dtype=scalar),
         adjoint_tolerance: wp.array(dtype=scalar),
         status: wp.array(dtype=int),
-        tries: wp.array(dtype=int),
-        size: wp.array(dtype=scalar),
-        first_size: wp.array(dtype=scalar),
-        continues: wp.array(dtype=int),
+        evaluations: wp.array(dtype=int),
+        residual_norm: wp.array(dtype=scalar),
+        first_residual_norm: wp.array(dtype=scalar),
+        iterate: wp.array(dtype=int),
     ):
-        """Whether ρ is to fall further, and falls: ‖ρ‖ is in the norm of ``judge``."""
+        """Choose whether ρ is to fall further, and falls: ‖ρ‖ is in the norm of ``control_newton``."""
         total = scalar(0.0)
         for i in range(nodes):
-            r = at(seed, i)
-            total += wp.dot(wp.cw_mul(at(inverse_x, i), r), r)
+            r = load(adjoint_rhs, i)
+            total += wp.dot(wp.cw_mul(load(inverse_x, i), r), r)
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
-                    total += at(inverse_s, s) * at(euler_seed, s) * at(euler_seed, s)
+                    total += load(inverse_s, s) * load(euler_adjoint_rhs, s) * load(euler_adjoint_rhs, s)
         now = wp.sqrt(total)
         falls = bool(True)
-        if tries[0] == 0:
-            first_size[0] = now
+        if evaluations[0] == 0:
+            first_residual_norm[0] = now
         else:
-            falls = now < scalar(0.5) * size[0]
-        tries[0] = tries[0] + 1
-        size[0] = now
-        continues[0] = 0
-        if falls and status[0] == 0 and now > adjoint_tolerance[0] * first_size[0]:
-            continues[0] = 1
+            falls = now < scalar(0.5) * residual_norm[0]
+        evaluations[0] = evaluations[0] + 1
+        residual_norm[0] = now
+        iterate[0] = 0
+        if falls and status[0] == 0 and now > adjoint_tolerance[0] * first_residual_norm[0]:
+            iterate[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
-    def absorb_stage(
+    def add_stage_adjoint(
         position_grad: wp.array(dtype=vec3),
         euler_grad: wp.array(dtype=scalar),
         increment_grad: wp.array(dtype=vec3),
@@ -168,7 +167,7 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity_grad: wp.array(dtype=vec3),
         base_euler_velocity_grad: wp.array(dtype=scalar),
     ):
-        """The adjoints of q₀ and v₀ gain what came through q = q₀ + η w and v₀ − w."""
+        """Add to the adjoints of q₀ and v₀ what came through q = q₀ + η w and v₀ − w."""
         i = index(wp.tid())
         base_position_grad[i] = base_position_grad[i] + position_grad[i]
         base_velocity_grad[i] = base_velocity_grad[i] + increment_grad[i]
@@ -179,10 +178,10 @@ def define(variant: Variant) -> SimpleNamespace:
                 base_euler_velocity_grad[s] = base_euler_velocity_grad[s] + euler_increment_grad[s]
 
     return SimpleNamespace(
-        recall_first_stage=recall_first_stage,
-        recall_carried_stage=recall_carried_stage,
+        restore_first_stage=restore_first_stage,
+        restore_carried_stage=restore_carried_stage,
         carry_adjoint=carry_adjoint,
         stage_adjoint_residual=stage_adjoint_residual,
-        judge_adjoint=judge_adjoint,
-        absorb_stage=absorb_stage,
+        control_adjoint=control_adjoint,
+        add_stage_adjoint=add_stage_adjoint,
     )

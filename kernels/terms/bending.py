@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 from . import mollifier
 
@@ -34,13 +35,13 @@ SERIES_BELOW = 1.0e-3
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """Warp functions of one bend, shared with the contact force."""
+    """Make the Warp functions of one bend, shared with the contact force."""
     scalar, vec3 = variant.scalar, variant.vec3
     vec2 = wp.types.vector(2, scalar)
 
     @wp.func
     def bend_angle(t1: vec3, t2: vec3) -> vec2:
-        """(θ², θ/sin θ)."""
+        """Compute (θ², θ/sin θ)."""
         cosine = -wp.dot(t1, t2)
         cross = wp.cross(t1, t2)
         z = wp.dot(cross, cross)
@@ -77,7 +78,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         square: scalar,
         angle_over_sine: scalar,
     ) -> vec3:
-        """Force on the end that t1 points to; k = 2k_b/Δs, mine and other (s, s', s'') of the two segments."""
+        """Compute the force on the end that t1 points to; k = 2k_b/Δs, mine and other (s, s', s'') of the two
+        segments."""
         force = (t2 - t1 * wp.dot(t1, t2)) * (-k * other[0] * angle_over_sine * mine[0] * by_length)
         if mine[1] > scalar(0.0):
             force -= t1 * (k * other[0] * scalar(0.5) * (square - scalar(wp.static(FLAT))) * mine[1])
@@ -85,21 +87,22 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def bend_stiffness(modulus: scalar, radius: scalar) -> scalar:
-        """k_b = B π R² [N m²]."""
+        """Compute k_b = B π R² [N m²]."""
         return modulus * scalar(wp.static(wp.PI)) * radius * radius
 
     return SimpleNamespace(angle=bend_angle, force=bend_force, stiffness=bend_stiffness)
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
     presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
 
     @wp.func
     def bend_forces(e1: vec3, e2: vec3, k: scalar, unit: scalar):
-        """Forces on the ends that e1 and e2 lead to."""
+        """Compute the forces on the ends that e1 and e2 lead to."""
         l1 = wp.length(e1)
         l2 = wp.length(e2)
         s1 = presence(l1, unit)
@@ -115,7 +118,7 @@ def define(variant: Variant) -> wp.Kernel:
 
     @wp.func
     def in_plane_excess(z: scalar, cosine: scalar, square: scalar, kappa: scalar, angle_over_sine: scalar) -> scalar:
-        """(1 − κ)/sin²θ, → 1/12 at θ = 0."""
+        """Compute (1 − κ)/sin²θ, → 1/12 at θ = 0."""
         if cosine > scalar(0.0) and z < scalar(wp.static(SERIES_BELOW)):
             series = scalar(wp.static(1.0 / 12.0)) + square * (
                 scalar(wp.static(1.0 / 720.0))
@@ -130,7 +133,6 @@ def define(variant: Variant) -> wp.Kernel:
         bend_nodes: wp.array(dtype=wp.vec3i),
         bend_yarn: wp.array(dtype=int),
         yarn_direction: wp.array(dtype=int),
-        stencil: int,
         # parameters
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
@@ -142,18 +144,11 @@ def define(variant: Variant) -> wp.Kernel:
         # forces out
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
-        press: int,
+        add_contact_load: int,
         contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         a = index(bend_nodes[e][0])
@@ -167,7 +162,7 @@ def define(variant: Variant) -> wp.Kernel:
         k = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / rest
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
-        if press != 0:
+        if add_contact_load != 0:
             # from the crimped positions, x − R n on a warp yarn and x + R n on a weft yarn
             half = scalar(0.5) - scalar(direction)
             crimp = scalar(-2.0) * half * radius[0]
@@ -203,7 +198,7 @@ def define(variant: Variant) -> wp.Kernel:
             wp.atomic_add(euler_force, sa, -f_s)
 
         if matrix != 0:
-            bare = weights[0][2] * k
+            bare = blocks.coefficients[0][2] * k
             stiffness = bare * s1[0] * s2[0]
             cosine = -wp.dot(t1, t2)
             w = wp.cross(t1, t2)
@@ -224,27 +219,27 @@ def define(variant: Variant) -> wp.Kernel:
                 bb += wp.outer(t1, t1) * (gain * s1[2] * s2[0])
             if s2[2] < scalar(0.0):
                 aa += wp.outer(t2, t2) * (gain * s2[2] * s1[0])
-            wp.atomic_add(diagonal_xx, a, aa)
-            wp.atomic_add(diagonal_xx, b, bb)
-            wp.atomic_add(diagonal_xx, c, aa + bb + ab + ba)
-            wp.atomic_add(upper_xx, index(stencil * a + direction), -(aa + ab))
-            wp.atomic_add(upper_xx, index(stencil * c + direction), -(ab + bb))
-            wp.atomic_add(upper_xx, index(stencil * a + 2 + direction), ab)
+            wp.atomic_add(blocks.diagonal_xx, a, aa)
+            wp.atomic_add(blocks.diagonal_xx, b, bb)
+            wp.atomic_add(blocks.diagonal_xx, c, aa + bb + ab + ba)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + direction), -(aa + ab))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * c + direction), -(ab + bb))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + 2 + direction), ab)
             if wp.static(sliding):
                 # θ dθ = (θ/sin θ) q·dx / l
                 xs_b = q1 * (stiffness * angle_over_sine * by_l1 / rest)
                 xs_a = q2 * (stiffness * angle_over_sine * by_l2 / rest)
                 xs_c = -(xs_a + xs_b)
                 ss = bare * faded / (rest * rest)
-                wp.atomic_add(diagonal_xs, sa, xs_a)
-                wp.atomic_add(diagonal_xs, sb, -xs_b)
-                wp.atomic_add(diagonal_ss, sa, ss)
-                wp.atomic_add(diagonal_ss, sb, ss)
-                wp.atomic_add(upper_xs, 4 * a + 2 + direction, -xs_a)
-                wp.atomic_add(upper_sx, 4 * a + 2 + direction, xs_b)
-                wp.atomic_add(upper_ss, 4 * a + 2 + direction, -ss)
-                wp.atomic_add(upper_sx, 4 * a + direction, xs_c)
-                wp.atomic_add(upper_xs, 4 * c + direction, -xs_c)
+                wp.atomic_add(blocks.diagonal_xs, sa, xs_a)
+                wp.atomic_add(blocks.diagonal_xs, sb, -xs_b)
+                wp.atomic_add(blocks.diagonal_ss, sa, ss)
+                wp.atomic_add(blocks.diagonal_ss, sb, ss)
+                wp.atomic_add(blocks.upper_xs, 4 * a + 2 + direction, -xs_a)
+                wp.atomic_add(blocks.upper_sx, 4 * a + 2 + direction, xs_b)
+                wp.atomic_add(blocks.upper_ss, 4 * a + 2 + direction, -ss)
+                wp.atomic_add(blocks.upper_sx, 4 * a + direction, xs_c)
+                wp.atomic_add(blocks.upper_xs, 4 * c + direction, -xs_c)
 
     return bending_term
 

@@ -20,12 +20,13 @@ import warp as wp
 
 from ..core.indexing import index
 from ..core.variant import Variant
+from . import mollifier
 
 FADING = 0.05
 """Sine of the angle between warp and weft under which a crossing's normal fades: 3 degrees, far beyond any lock."""
 
 MOST_PASSES = 4
-TURNED = {wp.float64: 1e-12, wp.float32: 1e-5}
+CONVERGED_TURN = {wp.float64: 1e-12, wp.float32: 1e-5}
 """Square of the sine by which a pass of the iteration may still turn a normal, its own error being the cube of that."""
 
 
@@ -35,7 +36,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def adjugate(m: mat33) -> mat33:
-        """The transposed cofactors: det(m) m⁻¹, defined for a singular m too."""
+        """Compute the transposed cofactors: det(m) m⁻¹, defined for a singular m too."""
         c0 = vec3(m[0, 0], m[1, 0], m[2, 0])
         c1 = vec3(m[0, 1], m[1, 1], m[2, 1])
         c2 = vec3(m[0, 2], m[1, 2], m[2, 2])
@@ -43,7 +44,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def least_eigenvalue(covariance: mat33) -> scalar:
-        """Trigonometric solution of the characteristic cubic of a symmetric matrix."""
+        """Solve the characteristic cubic of a symmetric matrix by cosines."""
         third = scalar(wp.static(1.0 / 3.0))
         mean = wp.trace(covariance) * third
         deviator = covariance - wp.identity(n=3, dtype=scalar) * mean
@@ -58,8 +59,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def near_normal(c: mat33, guess: vec3) -> vec3:
-        """Unit eigenvector of the smallest eigenvalue of a matrix of trace 1, from a guess of its direction; 0 where
-        that does not lead to it.
+        """Find the unit eigenvector of the smallest eigenvalue of a matrix of trace 1, from a guess of its direction; 0
+        where that does not lead to it.
 
         Rayleigh quotient iteration converges cubically, though to whichever eigenvector is near: it is the
         smallest eigenvalue's where the gaps to both others are positive, and so their product and sum.
@@ -73,7 +74,7 @@ def functions(variant: Variant) -> SimpleNamespace:
             n = m * last
             square = wp.dot(n, n)
             both, along = square * last_square, wp.dot(n, last)
-            if both - along * along < scalar(wp.static(TURNED[scalar])) * both:
+            if both - along * along < scalar(wp.static(CONVERGED_TURN[scalar])) * both:
                 if wp.trace(m) > scalar(0.0) and shift < scalar(wp.static(1.0 / 3.0)):
                     return wp.normalize(n)
                 return vec3()
@@ -81,7 +82,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def plane_normal(covariance: mat33, guess: vec3) -> vec3:
-        """Unit eigenvector of the smallest eigenvalue, of either sign; 0 where the points lie on no plane.
+        """Find the unit eigenvector of the smallest eigenvalue, of either sign; 0 where the points lie on no plane.
 
         Where the guess is too far from it: adj(C − λI) is n nᵀ times the other two gaps, so its largest column is the
         eigenvector; a second pass with the Rayleigh quotient of the first takes away what the cosine and the cubic
@@ -109,8 +110,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func_grad(plane_normal)
     def adj_plane_normal(covariance: mat33, guess: vec3, adj_ret: vec3):
-        """dn = −(C − λI)⁺ dC n. Through the eigenvalues themselves it would be singular at rest, where the other two
-        are equal; only their distance to the smallest one matters."""
+        """Reverse it: dn = −(C − λI)⁺ dC n. Through the eigenvalues themselves it would be singular at rest, where the
+        other two are equal; only their distance to the smallest one matters."""
         scale = wp.trace(covariance)
         n = plane_normal(covariance, guess)
         if wp.dot(n, n) > scalar(0.0):
@@ -126,6 +127,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 def define_normal(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     plane_normal = functions(variant).plane_normal
+    smoothstep = mollifier.functions(variant).smoothstep
 
     # a module of its own: drawing a recording needs this kernel alone, and not the minute that all terms compile
     @variant.kernel("contact")
@@ -157,7 +159,7 @@ def define_normal(variant: Variant) -> wp.Kernel:
             x = scalar(0.0)
             if full > scalar(0.0):
                 x = wp.abs(side) / full
-            n *= x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x))
+            n *= smoothstep(x)
         if (side < scalar(0.0)) != (flipped[i] != 0):
             n = -n
         normal[i] = n

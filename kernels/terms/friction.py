@@ -24,6 +24,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 
 FLOOR = 1.0e-7
@@ -43,7 +44,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def switch(z: scalar) -> scalar:
-        """tanh z to rounding of 1, at half the cost; from 20 on it is 1."""
+        """Compute tanh z to rounding of 1, at half the cost; from 20 on it is 1."""
         return scalar(1.0) - scalar(2.0) / (scalar(1.0) + wp.exp(scalar(2.0) * wp.min(z, scalar(20.0))))
 
     @wp.func
@@ -56,7 +57,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         floor: scalar,
         published_scaling: int,
     ) -> vec2:
-        """(F without its damping, −∂F/∂δ); limit = μF_n."""
+        """Compute (F without its damping, −∂F/∂δ); limit = μF_n."""
         by_force = sharpness
         by_length = sharpness
         if published_scaling == 0:
@@ -87,7 +88,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar = variant.scalar
+    BlockMatrix = structs(variant).BlockMatrix
     friction_force = functions(variant).force
 
     @variant.kernel("terms")
@@ -112,8 +114,7 @@ def define(variant: Variant) -> wp.Kernel:
         euler_momentum: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         i = index(crossing_node[e])
@@ -132,9 +133,9 @@ def define(variant: Variant) -> wp.Kernel:
             )
             friction_force_out[s] = f[0] - friction_damping[0] * euler_velocity[s]
             if matrix != 0:
-                damping = weights[0][1] * friction_damping[0]
+                damping = blocks.coefficients[0][1] * friction_damping[0]
                 wp.atomic_add(euler_momentum, s, damping * euler_velocity[s])
-                wp.atomic_add(diagonal_ss, s, damping + weights[0][2] * f[1])
+                wp.atomic_add(blocks.diagonal_ss, s, damping + blocks.coefficients[0][2] * f[1])
 
     return friction_term
 
@@ -143,7 +144,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
 
     @variant.kernel("terms")
-    def drag_anchor(
+    def update_anchor(
         crossing_node: wp.array(dtype=int),
         friction: wp.array(dtype=scalar),
         friction_stiffness: wp.array(dtype=scalar),
@@ -152,7 +153,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
         anchor: wp.array(dtype=scalar),
         anchor_next: wp.array(dtype=scalar),
     ):
-        """s̄ after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
+        """Move s̄ to where it is after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
         e = index(wp.tid())
         i = index(crossing_node[e])
         reach = friction[0] * wp.max(contact_load[i], scalar(0.0)) / friction_stiffness[0]
@@ -161,7 +162,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
             delta = euler_next[s] - anchor[s]
             anchor_next[s] = euler_next[s] - wp.clamp(delta, -reach, reach)
 
-    return drag_anchor
+    return update_anchor
 
 
 def define_energy(variant: Variant) -> wp.Kernel:
@@ -177,7 +178,8 @@ def define_energy(variant: Variant) -> wp.Kernel:
         contact_load: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        """What friction's springs can give back: the work of their force, at most μF_n, on the way to the anchor."""
+        """Add up what friction's springs can give back: the work of their force, at most μF_n, on the way to the
+        anchor."""
         i = crossing_node[wp.tid()]
         limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
         for direction in range(2):

@@ -10,7 +10,7 @@ nothing of it.
 
 import warp as wp
 
-from ..core.indexing import index
+from ..core.indexing import ends, index
 from ..core.variant import Term, TermParameter, Variant
 
 
@@ -19,9 +19,7 @@ def define(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("terms")
     def gravity_term(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         density: wp.array(dtype=scalar),
         gravity: wp.array(dtype=vec3),
         position: wp.array(dtype=vec3),
@@ -29,13 +27,7 @@ def define(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         half_density = scalar(0.5) * density[yarn]
         f = gravity[0] * (half_density * (euler[sb] - euler[sa]))
         wp.atomic_add(force, a, f)
@@ -53,21 +45,15 @@ def define_energy(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("energy")
     def gravity_energy(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         density: wp.array(dtype=scalar),
         gravity: wp.array(dtype=vec3),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        rest = euler[2 * b + direction] - euler[2 * a + direction]
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
+        rest = euler[sb] - euler[sa]
         height = wp.dot(gravity[0], position[a] + position[b])
         wp.atomic_add(energy, 0, scalar(-0.5) * density[yarn] * rest * height)
 

@@ -13,20 +13,19 @@ two vanish where yarns do not slide. Their derivatives are not symmetric, and ar
 
 import warp as wp
 
-from ..core.indexing import index
+from ..core.indexing import ends, index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 
 
 def define_mass(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    BlockMatrix = structs(variant).BlockMatrix
 
     @variant.kernel("terms")
     def mass_term(
         # topology
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
-        stencil: int,
+        segments: wp.array(dtype=wp.vec4i),
         # parameters
         density: wp.array(dtype=scalar),
         # state in
@@ -39,24 +38,11 @@ def define_mass(variant: Variant) -> wp.Kernel:
         euler_momentum: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
-        m = density[yarn] * rest * scalar(wp.static(1.0 / 6.0)) * weights[0][0]
+        m = density[yarn] * rest * scalar(wp.static(1.0 / 6.0)) * blocks.coefficients[0][0]
         two = scalar(2.0)
         va = velocity[a]
         vb = velocity[b]
@@ -76,20 +62,20 @@ def define_mass(variant: Variant) -> wp.Kernel:
 
         if matrix != 0:
             xx = wp.identity(n=3, dtype=scalar) * m
-            wp.atomic_add(diagonal_xx, a, two * xx)
-            wp.atomic_add(diagonal_xx, b, two * xx)
-            wp.atomic_add(upper_xx, index(stencil * a + direction), xx)
+            wp.atomic_add(blocks.diagonal_xx, a, two * xx)
+            wp.atomic_add(blocks.diagonal_xx, b, two * xx)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + direction), xx)
             if wp.static(sliding):
                 w = (position[b] - position[a]) / rest
                 xs = w * (-m)
                 ss = m * wp.dot(w, w)
-                wp.atomic_add(diagonal_xs, sa, two * xs)
-                wp.atomic_add(diagonal_xs, sb, two * xs)
-                wp.atomic_add(diagonal_ss, sa, two * ss)
-                wp.atomic_add(diagonal_ss, sb, two * ss)
-                wp.atomic_add(upper_xs, 4 * a + direction, xs)
-                wp.atomic_add(upper_sx, 4 * a + direction, xs)
-                wp.atomic_add(upper_ss, 4 * a + direction, ss)
+                wp.atomic_add(blocks.diagonal_xs, sa, two * xs)
+                wp.atomic_add(blocks.diagonal_xs, sb, two * xs)
+                wp.atomic_add(blocks.diagonal_ss, sa, two * ss)
+                wp.atomic_add(blocks.diagonal_ss, sb, two * ss)
+                wp.atomic_add(blocks.upper_xs, 4 * a + direction, xs)
+                wp.atomic_add(blocks.upper_sx, 4 * a + direction, xs)
+                wp.atomic_add(blocks.upper_ss, 4 * a + direction, ss)
 
     return mass_term
 
@@ -99,9 +85,7 @@ def define_inertia(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("terms")
     def inertia_term(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         density: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -110,14 +94,8 @@ def define_inertia(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        """∂T/∂q."""
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        """Add ∂T/∂q."""
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest
         va = velocity[a] - w * euler_velocity[sa]
@@ -140,9 +118,7 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("terms")
     def mass_rate_term(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         density: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -151,14 +127,8 @@ def define_mass_rate(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
     ):
-        """−Ṁ q̇: minus the rate of the momentum M q̇ when q moves and q̇ is held."""
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        """Add −Ṁ q̇: minus the rate of the momentum M q̇ when q moves and q̇ is held."""
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         w = (position[b] - position[a]) / rest
         va = velocity[a] - w * euler_velocity[sa]
@@ -187,9 +157,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("energy")
     def kinetic_energy(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         density: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -197,13 +165,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler_velocity: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         va = velocity[a]
         vb = velocity[b]

@@ -21,7 +21,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import index
+from ..core.indexing import ends, index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 from . import stretch as stretching
 
@@ -35,7 +36,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def barrier(rest: scalar, reach: scalar, stiffness: scalar) -> vec3:
-        """(V, −V', V'') of the barrier; stiffness [N]."""
+        """Compute (V, −V', V'') of the barrier; stiffness [N]."""
         x = rest / reach
         if x >= scalar(1.0):
             return vec3()
@@ -54,16 +55,15 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar = variant.scalar
+    BlockMatrix = structs(variant).BlockMatrix
     barrier = functions(variant).barrier
     stretch_stiffness = stretching.functions(variant).stiffness
 
     @variant.kernel("terms")
     def parallel_term(
         # topology
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         flipped: wp.array(dtype=int),
         # parameters
         parallel_stiffness: wp.array(dtype=scalar),
@@ -76,17 +76,9 @@ def define(variant: Variant) -> wp.Kernel:
         euler_force: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         distance = scalar(2.0) * radius[0]
         if flipped[a] != flipped[b]:
             distance = scalar(4.0) * radius[0]
@@ -100,10 +92,10 @@ def define(variant: Variant) -> wp.Kernel:
             wp.atomic_add(euler_force, sa, -f)
             wp.atomic_add(euler_force, sb, f)
             if matrix != 0:
-                ss = weights[0][2] * (k + guard[2])
-                wp.atomic_add(diagonal_ss, sa, ss)
-                wp.atomic_add(diagonal_ss, sb, ss)
-                wp.atomic_add(upper_ss, 4 * a + direction, -ss)
+                ss = blocks.coefficients[0][2] * (k + guard[2])
+                wp.atomic_add(blocks.diagonal_ss, sa, ss)
+                wp.atomic_add(blocks.diagonal_ss, sb, ss)
+                wp.atomic_add(blocks.upper_ss, 4 * a + direction, -ss)
 
     return parallel_term
 
@@ -115,9 +107,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("energy")
     def parallel_energy(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         flipped: wp.array(dtype=int),
         parallel_stiffness: wp.array(dtype=scalar),
         stretch: wp.array(dtype=scalar),
@@ -126,18 +116,15 @@ def define_energy(variant: Variant) -> wp.Kernel:
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = wp.tid()
-        a = segment_nodes[e][0]
-        b = segment_nodes[e][1]
-        direction = yarn_direction[segment_yarn[e]]
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         distance = scalar(2.0) * radius[0]
         if flipped[a] != flipped[b]:
             distance = scalar(4.0) * radius[0]
-        rest = euler[2 * b + direction] - euler[2 * a + direction]
+        rest = euler[sb] - euler[sa]
         overlap = wp.max(distance - rest, scalar(0.0))
         k = parallel_stiffness[0] * spacing[0]
         reach = radius[0] * scalar(wp.static(BARRIER))
-        guard = barrier(rest, reach, k + stretch_stiffness(stretch[segment_yarn[e]], radius[0]))
+        guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], radius[0]))
         wp.atomic_add(energy, 0, scalar(0.5) * k * overlap * overlap + guard[0])
 
     return parallel_energy

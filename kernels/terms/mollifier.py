@@ -25,22 +25,27 @@ def functions(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
 
     @wp.func
+    def smoothstep(x: scalar) -> scalar:
+        """Rise from 0 at 0 to 1 at 1, with two derivatives of 0 at both."""
+        return x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x))
+
+    @wp.func
     def presence(length: scalar, spacing: scalar) -> vec3:
-        """(s, s', s'') of a segment."""
+        """Compute (s, s', s'') of a segment."""
         reach = spacing * scalar(wp.static(REACH))
         if length >= reach:
             return vec3(scalar(1.0), scalar(0.0), scalar(0.0))
         x = length / reach
         left = scalar(1.0) - x
         return vec3(
-            x * x * x * (scalar(10.0) - x * (scalar(15.0) - scalar(6.0) * x)),
+            smoothstep(x),
             scalar(30.0) * x * x * left * left / reach,
             scalar(60.0) * x * left * (left - x) / (reach * reach),
         )
 
     @wp.func
     def inverse_length(length: scalar, spacing: scalar) -> scalar:
-        """1/l, and a finite number at l = 0, where s takes it away."""
+        """Compute 1/l, and a finite number at l = 0, where s takes it away."""
         return scalar(1.0) / wp.max(length, spacing * scalar(wp.static(1.0e-6 * REACH)))
 
-    return SimpleNamespace(presence=presence, inverse_length=inverse_length)
+    return SimpleNamespace(smoothstep=smoothstep, presence=presence, inverse_length=inverse_length)

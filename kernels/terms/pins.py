@@ -9,11 +9,13 @@ nodes out of the system (``kernels/stepping/linear.py``).
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3 = variant.scalar, variant.vec3
+    BlockMatrix = structs(variant).BlockMatrix
 
     @variant.kernel("terms")
     def pin_term(
@@ -23,14 +25,15 @@ def define(variant: Variant) -> wp.Kernel:
         position: wp.array(dtype=vec3),
         force: wp.array(dtype=vec3),
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         i = index(pin_node[e])
         wp.atomic_add(force, i, (pin_target[e] - position[i]) * pin_stiffness[0])
         if matrix != 0:
-            wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (weights[0][2] * pin_stiffness[0]))
+            wp.atomic_add(
+                blocks.diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (blocks.coefficients[0][2] * pin_stiffness[0])
+            )
 
     return pin_term
 

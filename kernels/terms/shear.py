@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 from . import mollifier
 
@@ -46,7 +47,8 @@ def functions(variant: Variant) -> SimpleNamespace:
     def shear_lock(
         strain: scalar, sine: scalar, cosine: scalar, threshold: scalar, spacing_by_radius: scalar, second: int
     ) -> vec3:
-        """(lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of φ/2.
+        """Compute (lock, its first and, where second is not 0, its second derivative by φ) of eq. 5; sine and cosine of
+        φ/2.
 
         ½ (1 − tanh z) = 1/(1 + exp 2z) =: part, of what is locked; z is from −5 to 14 whatever the angle.
         """
@@ -85,7 +87,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def shear_angle(t1: vec3, t2: vec3) -> vec3:
-        """(φ − π/2, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle."""
+        """Compute (φ − π/2, sin φ/2, cos φ/2) between two directions, exact to rounding at every angle."""
         half = scalar(0.5)
         across = wp.dot(t1, t2)
         if wp.abs(across) < scalar(WIDE):
@@ -100,13 +102,13 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def shear_shut(threshold: scalar, spacing_by_radius: scalar) -> scalar:
-        """The lock at φ = 0."""
+        """Compute the lock at φ = 0."""
         strain = scalar(wp.static(-0.5 * wp.PI))
         return shear_lock(strain, scalar(0.0), scalar(1.0), threshold, spacing_by_radius, 0)[0]
 
     @wp.func
     def shear_unlocked(shear: scalar, radius: scalar, spacing: scalar, load: scalar) -> scalar:
-        """k L of a corner that does not jam [N m]."""
+        """Compute k L of a corner that does not jam [N m]."""
         pressed = scalar(1.0) + wp.max(load, scalar(0.0))
         return shear * scalar(wp.static(wp.PI)) * radius * radius * pressed * spacing
 
@@ -114,7 +116,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3 = variant.scalar, variant.vec3
+    BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
     presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
@@ -134,7 +137,7 @@ def define(variant: Variant) -> wp.Kernel:
         shut: scalar,
         matrix: int,
     ):
-        """(force on p, force on r, ∇φ at p, ∇φ at r, factor of ∇φ ∇φᵀ, and of t tᵀ of p and of r).
+        """Compute (force on p, force on r, ∇φ at p, ∇φ at r, factor of ∇φ ∇φᵀ, and of t tᵀ of p and of r).
 
         s_p and s_r: (s, s', s'') of the two segments; shut: the lock at φ = 0, where one of them fades.
         """
@@ -178,7 +181,6 @@ def define(variant: Variant) -> wp.Kernel:
         crossing_neighbours: wp.array(dtype=wp.vec4i),
         corner_jams: wp.array(dtype=wp.vec4i),
         corner_blocks: wp.array(dtype=wp.vec4i),
-        stencil: int,
         # parameters
         shear: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
@@ -191,9 +193,7 @@ def define(variant: Variant) -> wp.Kernel:
         force: wp.array(dtype=vec3),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        upper_xx: wp.array(dtype=mat33),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         c = index(crossing_node[e])
@@ -254,7 +254,7 @@ def define(variant: Variant) -> wp.Kernel:
 
         if matrix != 0:
             # between two neighbours of the crossing, and of each with itself
-            h = weights[0][2]
+            h = blocks.coefficients[0][2]
             ul = wp.outer(g_ul, g_lu) * (h * k_lu)
             dl = wp.outer(g_dl, g_ld) * (h * k_ld)
             ur = wp.outer(g_ur, g_ru) * (h * k_ru)
@@ -268,20 +268,20 @@ def define(variant: Variant) -> wp.Kernel:
             rc = -(rr + wp.transpose(ur + dr))
             uc = -(uu + ul + ur)
             dc = -(dd + dl + dr)
-            wp.atomic_add(diagonal_xx, left, ll)
-            wp.atomic_add(diagonal_xx, right, rr)
-            wp.atomic_add(diagonal_xx, up, uu)
-            wp.atomic_add(diagonal_xx, down, dd)
-            wp.atomic_add(diagonal_xx, c, -(lc + rc + uc + dc))
-            wp.atomic_add(upper_xx, index(stencil * left), lc)
-            wp.atomic_add(upper_xx, index(stencil * c), wp.transpose(rc))
-            wp.atomic_add(upper_xx, index(stencil * up + 1), uc)
-            wp.atomic_add(upper_xx, index(stencil * c + 1), wp.transpose(dc))
-            blocks = corner_blocks[e]
-            wp.atomic_add(upper_xx, index(blocks[0]), ul)
-            wp.atomic_add(upper_xx, index(blocks[1]), wp.transpose(dl))
-            wp.atomic_add(upper_xx, index(blocks[2]), ur)
-            wp.atomic_add(upper_xx, index(blocks[3]), wp.transpose(dr))
+            wp.atomic_add(blocks.diagonal_xx, left, ll)
+            wp.atomic_add(blocks.diagonal_xx, right, rr)
+            wp.atomic_add(blocks.diagonal_xx, up, uu)
+            wp.atomic_add(blocks.diagonal_xx, down, dd)
+            wp.atomic_add(blocks.diagonal_xx, c, -(lc + rc + uc + dc))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * left), lc)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * c), wp.transpose(rc))
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * up + 1), uc)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * c + 1), wp.transpose(dc))
+            slots = corner_blocks[e]
+            wp.atomic_add(blocks.upper_xx, index(slots[0]), ul)
+            wp.atomic_add(blocks.upper_xx, index(slots[1]), wp.transpose(dl))
+            wp.atomic_add(blocks.upper_xx, index(slots[2]), ur)
+            wp.atomic_add(blocks.upper_xx, index(slots[3]), wp.transpose(dr))
 
     return shear_term
 

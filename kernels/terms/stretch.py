@@ -14,39 +14,38 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core.indexing import index
+from ..core.indexing import ends, index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """Warp functions of one segment, shared with the contact force."""
+    """Make the Warp functions of one segment, shared with the contact force."""
     scalar, vec3 = variant.scalar, variant.vec3
 
     @wp.func
     def stretch_stiffness(modulus: scalar, radius: scalar) -> scalar:
-        """kₛ = Y π R² [N]."""
+        """Compute kₛ = Y π R² [N]."""
         return modulus * scalar(wp.static(wp.PI)) * radius * radius
 
     @wp.func
     def stretch_force(d: vec3, rest: scalar, stiffness: scalar) -> vec3:
-        """Force on the segment's first node, kₛ(|w| − 1) t; the second feels the opposite."""
+        """Compute the force on the segment's first node, kₛ(|w| − 1) t; the second feels the opposite."""
         return wp.normalize(d) * (stiffness * (wp.length(d) / rest - scalar(1.0)))
 
     return SimpleNamespace(stiffness=stretch_stiffness, force=stretch_force)
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33, sliding = variant.scalar, variant.vec3, variant.mat33, variant.sliding
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    BlockMatrix = structs(variant).BlockMatrix
     stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
 
     @variant.kernel("terms")
     def stretch_term(
         # topology
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
-        stencil: int,
+        segments: wp.array(dtype=wp.vec4i),
         # parameters
         stretch: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
@@ -57,26 +56,13 @@ def define(variant: Variant) -> wp.Kernel:
         # forces out
         force: wp.array(dtype=vec3),
         euler_force: wp.array(dtype=scalar),
-        press: int,
+        add_contact_load: int,
         contact_load: wp.array(dtype=scalar),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        diagonal_xs: wp.array(dtype=vec3),
-        diagonal_ss: wp.array(dtype=scalar),
-        upper_xx: wp.array(dtype=mat33),
-        upper_xs: wp.array(dtype=vec3),
-        upper_sx: wp.array(dtype=vec3),
-        upper_ss: wp.array(dtype=scalar),
+        blocks: BlockMatrix,
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        sa = 2 * a + direction
-        sb = 2 * b + direction
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         d = position[b] - position[a]
         k = stretch_stiffness(stretch[yarn], radius[0])
@@ -84,7 +70,7 @@ def define(variant: Variant) -> wp.Kernel:
         f = stretch_force(d, rest, k)
         wp.atomic_add(force, a, f)
         wp.atomic_add(force, b, -f)
-        if press != 0:
+        if add_contact_load != 0:
             # added for the warp, subtracted for the weft
             half = scalar(0.5) - scalar(direction)
             wp.atomic_add(contact_load, a, half * wp.dot(normal[a], f))
@@ -97,22 +83,22 @@ def define(variant: Variant) -> wp.Kernel:
 
         if matrix != 0:
             t = wp.normalize(d)
-            along = weights[0][2] * k / rest
+            along = blocks.coefficients[0][2] * k / rest
             across = along * wp.max(ratio - scalar(1.0), scalar(0.0)) / wp.max(ratio, scalar(1.0e-12))
             xx = wp.outer(t, t) * (along - across) + wp.identity(n=3, dtype=scalar) * across
-            wp.atomic_add(diagonal_xx, a, xx)
-            wp.atomic_add(diagonal_xx, b, xx)
-            wp.atomic_add(upper_xx, index(stencil * a + direction), -xx)
+            wp.atomic_add(blocks.diagonal_xx, a, xx)
+            wp.atomic_add(blocks.diagonal_xx, b, xx)
+            wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + direction), -xx)
             if wp.static(sliding):
                 xs = t * (along * ratio)
                 ss = along * ratio * ratio
-                wp.atomic_add(diagonal_xs, sa, -xs)
-                wp.atomic_add(diagonal_xs, sb, -xs)
-                wp.atomic_add(diagonal_ss, sa, ss)
-                wp.atomic_add(diagonal_ss, sb, ss)
-                wp.atomic_add(upper_xs, 4 * a + direction, xs)
-                wp.atomic_add(upper_sx, 4 * a + direction, xs)
-                wp.atomic_add(upper_ss, 4 * a + direction, -ss)
+                wp.atomic_add(blocks.diagonal_xs, sa, -xs)
+                wp.atomic_add(blocks.diagonal_xs, sb, -xs)
+                wp.atomic_add(blocks.diagonal_ss, sa, ss)
+                wp.atomic_add(blocks.diagonal_ss, sb, ss)
+                wp.atomic_add(blocks.upper_xs, 4 * a + direction, xs)
+                wp.atomic_add(blocks.upper_sx, 4 * a + direction, xs)
+                wp.atomic_add(blocks.upper_ss, 4 * a + direction, -ss)
 
     return stretch_term
 
@@ -123,21 +109,15 @@ def define_energy(variant: Variant) -> wp.Kernel:
 
     @variant.kernel("energy")
     def stretch_energy(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         stretch: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        e = index(wp.tid())
-        a = index(segment_nodes[e][0])
-        b = index(segment_nodes[e][1])
-        yarn = index(segment_yarn[e])
-        direction = index(yarn_direction[yarn])
-        rest = euler[2 * b + direction] - euler[2 * a + direction]
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
+        rest = euler[sb] - euler[sa]
         strain = wp.length(position[b] - position[a]) / rest - scalar(1.0)
         k = stretch_stiffness(stretch[yarn], radius[0])
         wp.atomic_add(energy, 0, scalar(0.5) * k * rest * strain * strain)

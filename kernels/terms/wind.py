@@ -13,11 +13,13 @@ The matrix holds the exact derivative by velocity, which is symmetric positive s
 import warp as wp
 
 from ..core.indexing import index
+from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3 = variant.scalar, variant.vec3
+    BlockMatrix = structs(variant).BlockMatrix
 
     @variant.kernel("terms")
     def wind_term(
@@ -36,9 +38,7 @@ def define(variant: Variant) -> wp.Kernel:
         momentum: wp.array(dtype=vec3),
         # matrix out
         matrix: int,
-        weights: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
-        upper_xx: wp.array(dtype=mat33),
+        blocks: BlockMatrix,
     ):
         e = index(wp.tid())
         i = index(triangle_nodes[e][0])
@@ -59,19 +59,19 @@ def define(variant: Variant) -> wp.Kernel:
         wp.atomic_add(force, k, f)
 
         if matrix != 0:
-            h = weights[0][1] * third * third
+            h = blocks.coefficients[0][1] * third * third
             xx = wp.outer(n, n) * ((scalar(2.0) * pressure - drag) * h) + wp.identity(n=3, dtype=scalar) * (drag * h)
             p = xx * (mean_velocity * scalar(3.0))
             wp.atomic_add(momentum, i, p)
             wp.atomic_add(momentum, j, p)
             wp.atomic_add(momentum, k, p)
-            wp.atomic_add(diagonal_xx, i, xx)
-            wp.atomic_add(diagonal_xx, j, xx)
-            wp.atomic_add(diagonal_xx, k, xx)
-            blocks = triangle_blocks[e]
-            wp.atomic_add(upper_xx, index(blocks[0]), xx)
-            wp.atomic_add(upper_xx, index(blocks[1]), xx)
-            wp.atomic_add(upper_xx, index(blocks[2]), xx)
+            wp.atomic_add(blocks.diagonal_xx, i, xx)
+            wp.atomic_add(blocks.diagonal_xx, j, xx)
+            wp.atomic_add(blocks.diagonal_xx, k, xx)
+            slots = triangle_blocks[e]
+            wp.atomic_add(blocks.upper_xx, index(slots[0]), xx)
+            wp.atomic_add(blocks.upper_xx, index(slots[1]), xx)
+            wp.atomic_add(blocks.upper_xx, index(slots[2]), xx)
 
     return wind_term
 

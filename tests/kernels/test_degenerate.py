@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-import warp_yarn.torch as wt
 from cases import YARNS, scene
 from checks import check_definite
 
 import warp_yarn as wy
+import warp_yarn.torch as wt
 
 SIZE = 5
 

@@ -157,7 +157,7 @@ def test_anchor_is_held_or_dragged(slid: float) -> None:
         name: type(sim.arrays["anchor"])(values.ravel(), dtype=sim.arrays["anchor"].dtype)
         for name, values in (("anchor", before), ("euler_next", after), ("anchor_next", before))
     }
-    sim.model.launch("drag_anchor", "crossings", **arrays)
+    sim.model.launch("update_anchor", "crossings", **arrays)
     delta = after - arrays["anchor_next"].numpy().reshape(9, 2)
     expected = np.zeros((9, 2))
     expected[4] = np.clip(slid, -1.0, 1.0) * reach

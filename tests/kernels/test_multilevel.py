@@ -46,7 +46,7 @@ def apply(sim: wy.Simulator, r: np.ndarray) -> np.ndarray:
     if sim.scene.sliding:
         a["euler_rhs"].assign(r[n:])
     arrays = {name: a[name] for name in SOLVED}
-    sim.model.launch("multilevel_conjugate_gradient", 1, strip=0, most_iterations=0, **arrays)
+    sim.model.launch("multilevel_conjugate_gradient", 1, thread=0, most_iterations=0, **arrays)
     a.zero("status")
     parts = [a["t_x"].numpy().ravel()]
     if sim.scene.sliding:
@@ -211,7 +211,7 @@ def test_two_threads_make_the_same_iterates(sliding):
     ends = []
     for threads in (1, 2):
         sim = simulator("handkerchief", 5, 17, sliding, "exact", threads=threads, tolerance=1e-3)
-        assert sim.model.strips == threads
+        assert sim.model.threads.count == threads
         start = sim.state
         start.velocity[:] = np.random.default_rng(3).normal(0.0, 0.1, start.velocity.shape)
         sim.state = start

@@ -1,7 +1,8 @@
-"""A scene's arrays on the device, named as the kernels' arguments name them.
+"""A scene's arrays on the device, named as the kernels' arguments name them, and made as ``declarations.py`` declares.
 
 What a scene does not use is None: without sliding there is nothing of the Eulerian coordinates but their fixed rest
-values, without shear and friction nothing of the contact, and so on.
+values, without shear and friction nothing of the contact, and so on. What acts on the cloth (``INPUTS``) and is not
+there has no name here at all.
 """
 
 from typing import Any
@@ -12,26 +13,28 @@ import warp as wp
 from ..description.cloth import Cloth
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
-from ..errors import InputError
-from ..kernels import TERMS, Term, Variant, build
-from ..kernels.linear import multilevel
+from ..kernels import TERMS, Term, Variant
+from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
-
-LARGE = 1 << 20
-"""Bytes of an array."""
+from . import declarations
+from .declared import DeclaredArrays
+from .fields import Field, conditions
 
 YARN_PARAMETERS = ("density", "stretch", "bend")
 
-STATE_TYPES = {"position": 3, "euler": 2, "velocity": 3, "euler_velocity": 2, "anchor": 2}
+STATE_TYPES = {name: 3 if field.kind == "vec3" else field.count for name, field in declarations.STATE.items()}
 """Numbers a node has in each array of the state."""
 
 
-class Arrays(dict[str, Any]):
-    """Everything that kernels of a scene are launched with: arrays, and the two counts that they need."""
+class Arrays(DeclaredArrays):
+    """Everything that kernels of a scene are launched with: arrays, and the counts that they need.
+
+    Attributes:
+        origin: where positions on the device are counted from [m].
+    """
 
     def __init__(self, scene: Scene, variant: Variant, device: Any):
-        super().__init__()
-        self.scene, self.variant, self.device = scene, variant, device
+        self.scene = scene
         self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
@@ -39,55 +42,54 @@ class Arrays(dict[str, Any]):
         # differentiated by positions stays where it is.
         near = variant.scalar is wp.float32 and not variant.reverse
         self.origin = scene.cloth.position.mean(axis=0) if near else np.zeros(3)
-        """Where positions on the device are counted from [m]."""
+        topology = scene.cloth.topology
+        sizes = {
+            "world": 1,
+            "cloth": 1,
+            "node": topology.nodes,
+            "block": self.stencil * topology.nodes,
+            "yarn": len(topology.yarn_direction),
+            "segment": len(topology.segment_nodes),
+            "bend": len(topology.bend_nodes),
+            "crossing": len(topology.crossing_node),
+            "triangle": len(topology.triangle_nodes),
+            "pin": len(scene.pins),
+            "pin step": 0 if scene.pin_path is None else scene.pin_path[..., 0].size,
+            "applied": len(scene.force_nodes),
+            "applied step": scene.force_path[..., 0].size,
+        }
+        dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "pin")}
+        dims["applied"] = sizes["applied"]
+        super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)
-        self._state()
-        self._work()
-        self.dims = {
-            "nodes": self["nodes"],
-            "segments": len(self["segment_nodes"]),
-            "bends": len(self["bend_nodes"]),
-            "crossings": len(self["crossing_node"]),
-            "triangles": len(self["triangle_nodes"]) if self["triangle_nodes"] is not None else 0,
-            "pins": len(scene.pins),
-            "applied": len(scene.force_nodes),
-        }
+        for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
+            self.make(group)
 
-    def __missing__(self, name: str) -> None:
-        raise InputError(f"no array of this scene is called {name!r}, of which a kernel has an argument")
-
-    def zeros(self, count: int, dtype: Any) -> wp.array:
-        return wp.zeros(count, dtype=dtype, device=self.device)
-
-    def numbers(self, values: Any) -> wp.array:
-        """A parameter: an array of the variant's scalars, or of its vectors where values has a second axis of 3."""
-        values = np.atleast_1d(np.asarray(values, dtype=np.float64))
-        dtype = self.variant.vec3 if values.ndim == 2 else self.variant.scalar
-        return wp.array(values.astype(wp.dtype_to_numpy(self.variant.scalar)), dtype=dtype, device=self.device)
+    def _indices(self, name: str, values: np.ndarray) -> None:
+        """Set an index array, or None where the scene has no use for it."""
+        field = self._declaration(name)
+        there = field.when in self.conditions
+        # on the CPU the same memory: nobody writes to either
+        shared = {"dtype": field.dtype(self.variant), "device": self.device, "copy": False}
+        self[name] = wp.array(np.ascontiguousarray(values), **shared) if there else None
 
     def _topology(self, cloth: Cloth) -> None:
-        topology = cloth.topology
-        kernels = build(self.variant, self.scene.terms)
-        names = {name for term in self.terms for name in (term.name, f"{term.name}_energy")}
-        read = {argument.label for name in names & set(kernels) for argument in kernels[name].adj.args}
-        vectors = {1: wp.int32, 2: wp.vec2i, 3: wp.vec3i, 4: wp.vec4i}
-        for name, values in vars(topology).items():
-            if name == "neighbour":
-                values = np.ascontiguousarray(values[:, : self.stencil]).ravel()
-            if not isinstance(values, np.ndarray) or name == "node_yarns":
-                continue
-            dtype = vectors[1 if values.ndim == 1 else values.shape[1]]
-            # on the CPU the same memory: nothing writes to either
-            shared = {"dtype": dtype, "device": self.device, "copy": False}
-            # the largest, which no kernel reads but those of terms
-            skipped = name.startswith(("corner_", "triangle_")) and name not in read
-            self[name] = None if skipped else wp.array(values, **shared)
+        topology, yarn = cloth.topology, cloth.topology.segment_yarn
         free = np.ones(topology.nodes, dtype=np.int32)
-        if self.scene.pin_stiffness is None:
+        if "hard pins" in self.conditions:
             free[self.scene.pins] = 0
-        self["is_free"] = wp.array(free, dtype=wp.int32, device=self.device)
-        self["nodes"], self["stencil"] = topology.nodes, self.stencil
+        made = {
+            "segments": np.column_stack([topology.segment_nodes, yarn, topology.yarn_direction[yarn]]),
+            "neighbour": topology.neighbour[:, : self.stencil].ravel(),
+            "is_free": free,
+        }
+        counts = {"nodes": topology.nodes, "columns": cloth.weave.columns, "stencil": self.stencil}
+        for name in declarations.TOPOLOGY:
+            if name in counts:
+                self[name] = counts[name]
+            else:
+                self._indices(name, made[name] if name in made else getattr(topology, name))
 
     def _parameters(self, scene: Scene) -> None:
         cloth = scene.cloth
@@ -119,148 +121,54 @@ class Arrays(dict[str, Any]):
                 self["applied_force_path"] = self.numbers(scene.force_path.reshape(-1, 3))
         self["published_scaling"] = int(scene.published_scaling)
         for name, parameter in scene.registered.items():
+            element = "yarn" if parameter.of == "yarn" else "world"
+            kind = "vec3" if parameter.size == 3 else "scalar"
+            self.declare(name, Field(element, 1, kind, parameter.unit, "always", "of a term from outside the package"))
             value = scene.registered_value(name)
             self[name] = self.numbers(value[cloth.material] if parameter.of == "yarn" else value[None])
 
-    def _state(self) -> None:
-        n, scalar, vec3 = self["nodes"], self.variant.scalar, self.variant.vec3
-        friction = any(term.name == "friction" for term in self.terms)
-        for name, width in STATE_TYPES.items():
-            stored = {"euler_velocity": self.variant.sliding, "anchor": friction}.get(name, True)
-            dtype, count = (vec3, n) if width == 3 else (scalar, 2 * n)
-            self[name] = self.zeros(count, dtype) if stored else None
-
-    def _work(self) -> None:
-        n, scalar, vec3, mat33 = self["nodes"], self.variant.scalar, self.variant.vec3, self.variant.mat33
-        sliding = self.variant.sliding
-        self["normal"] = self.zeros(n, vec3) if self.contact else None
-        self["contact_load"] = self.zeros(n, scalar) if self.contact else None
-        for name in ("force", "momentum", "rhs", "solution", "r_x", "p_x", "q_x", "t_x", "inverse_x"):
-            self[name] = self.zeros(n, vec3)
-        for name in (
-            "euler_force",
-            "euler_momentum",
-            "euler_rhs",
-            "euler_solution",
-            "r_s",
-            "p_s",
-            "q_s",
-            "t_s",
-            "inverse_s",
-        ):
-            self[name] = self.zeros(2 * n, scalar) if sliding else None
-        self["friction_force_out"] = self.zeros(2 * n, scalar) if self["anchor"] is not None else None
-        self["diagonal_xx"] = self.zeros(n, mat33)
-        self["inverse_pivot"] = self.zeros(n, self.variant.sym33)
-        self["upper_xx"] = self.zeros(self.stencil * n, mat33)
-        for name, count, dtype in (
-            ("diagonal_xs", 2 * n, vec3),
-            ("diagonal_ss", 2 * n, scalar),
-            ("upper_xs", 4 * n, vec3),
-            ("upper_sx", 4 * n, vec3),
-            ("upper_ss", 4 * n, scalar),
-        ):
-            self[name] = self.zeros(count, dtype) if sliding else None
-        self["status"] = self.zeros(3, wp.int32)
-        self["counters"] = self.zeros(2, wp.int32)
-        self["iterations"] = self.zeros(1, wp.int32)
-        self["residual"] = self.zeros(1, scalar)
-        self["weights"] = self.zeros(1, vec3)
-        self["step_size"] = self.zeros(1, scalar)
-        self["remaining"] = self.zeros(1, scalar)
-        self["stage_times"] = self.zeros(4, scalar)
+    def add_frames(self, count: int) -> None:
+        """Make room for so many frames of what moves, as ``frame_position`` and so on."""
+        self.sizes["frame node"] = count * self.sizes["node"]
+        self.make(declarations.FRAMES)
 
     def add_levels(self) -> None:
-        """Makes room for the multilevel preconditioner: its index arrays, and what it factorizes."""
+        """Make room for the multilevel preconditioner: its index arrays, and what it factorizes."""
         free = self["is_free"].numpy() != 0
         found = levels(self.scene.cloth.topology, self.stencil, free)
-        unknowns = 4 if self.variant.sliding else 3
-        scalar, vec3, mat33, sym33 = self.variant.scalar, self.variant.vec3, self.variant.mat33, self.variant.sym33
-        result = multilevel.structs(self.variant.forward).Levels()
-        for name, values in vars(found).items():
-            if isinstance(values, np.ndarray):
-                dtype = wp.int32 if values.dtype == np.int32 else scalar
-                values = np.ascontiguousarray(values).ravel().astype(wp.dtype_to_numpy(dtype))
-                setattr(result, name, wp.array(values, dtype=dtype, device=self.device))
-            else:
-                setattr(result, name, values)
-        coarse = found.coarse_nodes
-        sizes = np.diff(found.level_start)
-        result.coarse_levels = len(sizes)
-        result.exact = int(sizes[-1]) if coarse else 0
-        for name, count, dtype in (
-            ("coarse_block", BLOCKS * coarse, mat33),
-            ("line_factor", 8 * unknowns * len(found.line_node), scalar),
-            ("coarse_line_factor", 24 * len(found.coarse_line_node), scalar),
-            ("halves", self["nodes"], sym33),
-            ("coarse_halves", coarse, sym33),
-            ("coarsest", (3 * result.exact) ** 2, scalar),
-            ("line_work", 4 * len(found.line_node), scalar),
-            ("coarse_line_work", 4 * len(found.coarse_line_node), scalar),
-            ("coarse_r", coarse, vec3),
-            ("coarse_z", coarse, vec3),
-        ):
-            setattr(result, name, self.zeros(count, dtype))
+        coarse, sizes = found.coarse_nodes, np.diff(found.level_start)
+        exact = int(sizes[-1]) if coarse else 0
+        self.sizes |= {
+            "line end": len(found.line_start),
+            "line node": len(found.line_node),
+            "line factor": 8 * (4 if self.variant.sliding else 3) * len(found.line_node),
+            "level end": len(found.level_start),
+            "coarse line end": len(found.coarse_line_start),
+            "coarse line node": len(found.coarse_line_node),
+            "coarse node": coarse,
+            "coarse node end": coarse + 1,
+            "coarse block": BLOCKS * coarse,
+            "coarse block end": BLOCKS * coarse + 1,
+            "any node": self.sizes["node"] + coarse,
+            "child": len(found.child),
+            "part": len(found.part),
+            "coarsest pair": exact**2,
+            "coarsest entry": (3 * exact) ** 2,
+        }
+        counts = {"coarse_levels": len(sizes), "blocks_per_node": BLOCKS, "exact": exact}
+        result = structs(self.variant.forward).Levels()
+        for name, field in declarations.LEVELS.items():
+            value = counts[name] if name in counts else getattr(found, name, None)
+            if value is None:
+                value = self.new(name)
+            elif isinstance(value, np.ndarray):
+                dtype = field.dtype(self.variant)
+                value = np.ascontiguousarray(value).ravel().astype(wp.dtype_to_numpy(dtype))
+                value = wp.array(value, dtype=dtype, device=self.device)
+            setattr(result, name, value)
         self["levels"] = result
         self.level_start = found.level_start.tolist()
         self.dims["warp_lines"] = found.warp_lines
         self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
         self.dims["coarse_warp_lines"] = found.coarse_warp_lines
         self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
-
-    def put(self, name: str, *values: float) -> None:
-        """Sets all numbers of a small array. On the CPU in its own memory: ``assign`` takes 20 µs to get there."""
-        if self.device.is_cpu:
-            self[name].numpy().reshape(-1)[:] = values
-        else:
-            self[name].assign(np.array(values))
-
-    def zero(self, *names: str) -> None:
-        """Sets arrays to 0, those that the scene has."""
-        for name in names:
-            if self[name] is not None:
-                self._clear(self[name])
-
-    def require_grad(self, *names: str) -> None:
-        """Makes room for the gradients of arrays, those that the scene has."""
-        for name in names:
-            if self[name] is not None:
-                self[name].requires_grad = True
-
-    def zero_grad(self, *names: str) -> None:
-        """Sets gradients to 0, of the arrays that the scene has."""
-        for name in names:
-            if self[name] is not None:
-                self._clear(self[name].grad)
-
-    def _clear(self, array: wp.array) -> None:
-        """Sets an array to 0: by a kernel where it is large, since zero_ is faster, but a graph that is captured on the
-        CPU keeps as many bytes as it clears for itself (Warp 1.19)."""
-        if array.capacity < LARGE:
-            array.zero_()
-        else:
-            kind = {self.variant.vec3: "vectors", self.variant.mat33: "matrices"}.get(array.dtype, "numbers")
-            clear = build(self.variant)[f"clear_{kind}"]
-            # as zero_, no part of a tape
-            wp.launch(clear, dim=array.shape[0], inputs=[array], device=self.device, record_tape=False)
-
-    def launch(self, kernel: wp.Kernel, elements: str | int, **replaced: Any) -> None:
-        """Launches a kernel over elements, its arguments found by their names."""
-        dim = self.dims[elements] if isinstance(elements, str) else elements
-        if dim:
-            inputs = [replaced[a.label] if a.label in replaced else self.find(a.label) for a in kernel.adj.args]
-            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
-
-    def find(self, label: str) -> Any:
-        """What a kernel's argument of this name stands for; ``x_grad`` is the gradient of ``x``."""
-        if label.endswith("_grad"):
-            array = self[label.removesuffix("_grad")]
-            return None if array is None else array.grad
-        return self[label]
-
-    def add_frames(self, count: int) -> None:
-        """Makes room for so many frames of what moves, as ``frame_position`` and so on."""
-        for name in STATE_TYPES:
-            array = self[name]
-            still = array is None or (name == "euler" and not self.variant.sliding)
-            self[f"frame_{name}"] = None if still else self.zeros(count * array.shape[0], array.dtype)

@@ -7,22 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
-import threading
-import time
-from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, number, whole
 from ..kernels import TERMS, Term, Variant, build
-from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
-from . import exclusive
+from . import defaults
 from .arrays import Arrays
+from .defaults import PRECISIONS, PRECONDITIONERS
+from .energy_watch import AT_END, EnergyWatch
+from .inputs import Inputs
+from .threads import Threads
 
 MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
@@ -30,51 +28,8 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-AT_END, AT_START = 2, 3
-"""The places of a step's end and start among ``stage_times``, behind those of two stages."""
-PATHS = ("pin_target", "applied_force")
-"""Inputs that may change from step to step."""
-NARROWEST_STRIP = 8
-"""Columns; the sweeps need 3 at least, and fewer than these do not pay."""
 SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
 """What differs from one linear solve to another."""
-PRECONDITIONERS = ("multilevel", "incomplete", "jacobi")
-PRECISIONS = {"double": wp.float64, "single": wp.float32}
-TOLERANCES = {"double": 1e-6, "single": 1e-4}
-"""Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
-NEWTON_TOLERANCE = 2e-2
-SLOW = 1e3
-"""k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error
-smaller, as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
-TIGHT = {"double": 1e-2, "single": 1e-1}
-STIFF = 2e4
-"""k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch
-wave runs over a hundred crossings in a step."""
-STIFF_SLIDING = 3.0
-"""The same where friction's damping does not hold the rates of sliding: the incomplete factorization takes their
-diagonal for its pivots, and its sweeps grow from yarn to yarn. On 61 × 61 yarns it "converged" 100 % off from 20 on."""
-HOLDING = 10.0
-"""Times h k_s/L that friction's damping must have to hold the rates."""
-RESOLVED = 4.0
-"""Of steps that do not resolve the yarns' vibrations: a stretch wave runs from a crossing to the next in less than the
-``RESOLVED``-th part of a step. A tenth at most is then added to the error of the second-order methods. The error of
-shorter steps falls with their square, and so does the tolerance in double precision."""
-EXACT = 1e-8
-"""Both tolerances of differentiable runs in double precision: gradients are right to no more digits than these."""
-
-
-class Graphs(dict[str, Any]):
-    """Launches by name, captured at their first call and replayed from then on: twenty of them cost microseconds."""
-
-    def __init__(self, device: Any):
-        super().__init__()
-        self.device = device
-
-    def run(self, name: str, part: Callable[[], None]) -> None:
-        """Launches what a function launches; the function is called the first time alone."""
-        if name not in self:
-            self[name] = exclusive.capture(self.device, part)
-        exclusive.replay(self[name])
 
 
 class Model:
@@ -87,8 +42,10 @@ class Model:
     Attributes:
         arrays: by the names that kernels use.
         kernels: by name.
-        strips: of the cloth, one a processor core that a linear solve takes.
-        held: whether pins are exact.
+        inputs: those that change from step to step.
+        energy: the watch over it.
+        threads: processor cores that share a linear solve.
+        has_hard_pins: whether pins are exact.
     """
 
     def __init__(
@@ -111,92 +68,42 @@ class Model:
         self.step_size = number("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
         if preconditioner is None:
-            preconditioner = "multilevel" if self._needs_levels() else "incomplete"
+            preconditioner = defaults.preconditioner(scene, self.step_size)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
         exact = differentiable and precision == "double"
-        default = EXACT if exact else TOLERANCES[precision]
-        self.tolerance = number("tolerance", default if tolerance is None else tolerance, above=0.0)
+        if tolerance is None:
+            tolerance = defaults.tolerance(precision, exact=exact)
+        self.tolerance = number("tolerance", tolerance, above=0.0)
         if newton_tolerance is None and exact:
-            newton_tolerance = EXACT
-        self._resolving = self._resolving_rate()
-        self._newton_tolerance = None
-        if newton_tolerance is not None:
-            self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0)
-        degrees = scene.cloth.nodes * (5 if scene.sliding else 3)
-        most = max(1000, degrees) if max_iterations is None else max_iterations
-        self.max_iterations = whole("max_iterations", most, least=1)
-        try:
-            self.device = wp.get_device(device)
-        except Exception as error:
-            names = ", ".join(str(d) for d in wp.get_devices())
-            raise InputError(f"device = {device!r}, must be one of {names}") from error
+            newton_tolerance = defaults.EXACT
+        given = newton_tolerance is not None
+        self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0) if given else None
+        if max_iterations is None:
+            max_iterations = defaults.max_iterations(scene)
+        self.max_iterations = whole("max_iterations", max_iterations, least=1)
+        self.device = _checked_device(device)
         for name in scene.terms:  # one may have been registered when the scene was made
             choice("scene.terms", name, TERMS)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = build(variant, scene.terms)
-        self.held = len(scene.pins) > 0 and scene.pin_stiffness is None
         self.arrays = Arrays(scene, variant, self.device)
+        self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
-        self._add_ledger()
-        self.arrays["tolerance"] = self.arrays.numbers(self.tolerance)
+        self.inputs = Inputs(self)
+        self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
-        self._form_team(whole("threads", threads, least=1))
-
-    def _needs_levels(self) -> bool:
-        """Whether the incomplete factorization takes longer than lines on many levels, or does not work."""
-        cloth, h = self.scene.cloth, self.step_size
-        stretch = h * cloth.stretch_stiffness.max() / cloth.spacing
-        held = "friction" in self.scene.terms and cloth.friction_damping > HOLDING * stretch
-        stiffness = (self._stretch_rate().max() * h) ** 2
-        return stiffness > (STIFF if held or not self.scene.sliding else STIFF_SLIDING)
+        self.threads = Threads(self, whole("threads", threads, least=1))
+        self.arrays.put("tolerance", self.tolerance)
 
     def newton_tolerance_at(self, step: float) -> float:
-        """As given, or what follows the error of steps of this size."""
+        """Give the tolerance that was asked for, or what follows the error of steps of this size [s]."""
         if self._newton_tolerance is not None:
             return self._newton_tolerance
-        fastest = float(self._stretch_rate().max())
-        slow = min(1.0, math.sqrt(SLOW) / (fastest * step)) if fastest > 0.0 else 1.0
-        resolved = min(1.0, step * self._resolving) ** 2
-        return max(EXACT, NEWTON_TOLERANCE * max(TIGHT[self.precision], slow) * resolved)
-
-    def _resolving_rate(self) -> float:
-        """Of steps that begin to resolve the yarns' stretching [1/s]."""
-        rate = self._stretch_rate()
-        if self.precision == "single" or not rate.any():
-            return math.inf
-        return rate[rate > 0.0].min() / RESOLVED
-
-    def _stretch_rate(self) -> np.ndarray:
-        """√(k_s/(m L)) of every material, m the mass of a segment [1/s]."""
-        cloth = self.scene.cloth
-        return np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns]) / cloth.spacing
-
-    def _form_team(self, threads: int) -> None:
-        """Strips of the cloth for so many processor cores (``kernels/linear/threads.py``)."""
-        a = self.arrays
-        if threads > 1 and not (self.device.is_cpu and self.preconditioner != "jacobi"):
-            raise InputError(
-                f"threads = {threads}, must be 1 on {self.device} with the {self.preconditioner!r} preconditioner: "
-                "only the CPU's 'incomplete' and 'multilevel' ones share their work"
-            )
-        columns = self.scene.cloth.weave.columns
-        self.strips = max(1, min(threads, columns // NARROWEST_STRIP))
-        a["columns"] = columns
-        a["sums"] = a.zeros(5 * self.strips, a.variant.scalar)
-        a["team"] = a.zeros(16 + 16 * self.strips, wp.int32)
-        self._team_of(1)
-        if self.strips > 1:
-            for name in SOLVED:
-                a[f"team_{name}"] = None if a[name] is None else a.zeros(a[name].shape[0], a[name].dtype)
-
-    def _team_of(self, strips: int) -> None:
-        """Begins to count anew, for so many strips."""
-        team = self.arrays["team"]
-        team.assign(np.where(np.arange(len(team)) == 3, strips, 0).astype(np.int32))
+        return defaults.newton_tolerance(self.scene, self.precision, step)
 
     def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
-        """The step that kernels make.
+        """Sets the times of the step that kernels make.
 
         Args:
             step: h [s].
@@ -207,26 +114,24 @@ class Model:
         a = self.arrays
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
-        reached = [1.0 if self.held else begun + time * step / self.step_size for time in (*times, 1.0)]
+        reached = [1.0 if self.has_hard_pins else begun + time * step / self.step_size for time in (*times, 1.0)]
         a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)), begun)
         a.put("step_size", step)
         a.put("remaining", remaining)
-        a.put("weights", 1.0, stage, stage * stage)
+        a.put("coefficients", 1.0, stage, stage * stage)
 
     def launch(self, kernel: str, elements: str | int, **replaced: Any) -> None:
         """Launches a kernel by its name (see ``Arrays.launch``)."""
         self.arrays.launch(self.kernels[kernel], elements, **replaced)
 
+    def launch_term(self, term: Term, **offered: Any) -> None:
+        """Launch a term, with what its kernel has arguments for."""
+        self.launch(term.name, term.elements, **self.arrays.taken(self.kernels[term.name], **offered))
+
     def copy(self, **targets: str) -> None:
         """Copies arrays, target="source", those that the scene has; ``x_grad`` is the gradient of ``x``."""
         for target, source in targets.items():
-            self.copy_array(self.arrays.find(target), self.arrays.find(source))
-
-    def copy_array(self, target: wp.array | None, source: wp.array | None) -> None:
-        """By a kernel: wp.copy copies gradients too, and keeps a copy for itself where it is captured on the CPU."""
-        if target is not None:
-            kernel = "copy_vectors" if target.dtype == self.arrays.variant.vec3 else "copy_numbers"
-            self.launch(kernel, target.shape[0], source=source, target=target)
+            self.arrays.copy_into(self.arrays.find(target), self.arrays.find(source))
 
     def assemble(
         self,
@@ -254,7 +159,7 @@ class Model:
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
-            self.launch(term.name, term.elements, matrix=filled, press=int(a.contact), **arrays)
+            self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def _find_normals(self) -> None:
@@ -263,7 +168,7 @@ class Model:
             self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
 
-    def press(self) -> None:
+    def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
         a = self.arrays
         self._find_normals()
@@ -271,223 +176,83 @@ class Model:
             if a.contact and term.presses:
                 # the forces go where the solver works
                 unused = {"force": a["q_x"], "euler_force": a["q_s"]}
-                self.launch(term.name, term.elements, matrix=0, press=1, **unused)
+                self.launch_term(term, matrix=0, add_contact_load=1, **unused)
 
-    def prescribe(self, **replaced: Any) -> None:
+    def set_pin_velocity(self, **replaced: Any) -> None:
         """Gives exact pins the velocity that brings them to their place."""
-        if self.held:
-            self.launch("prescribe", "pins", **replaced)
+        if self.has_hard_pins:
+            self.launch("set_pin_velocity", "pins", **replaced)
 
     def factorize(self) -> None:
-        """The preconditioner of the assembled matrix."""
+        """Computes the preconditioner of the assembled matrix."""
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
         if self.preconditioner == "multilevel":
-            self._factorize_levels()
-
-    def _factorize_levels(self) -> None:
-        starts = self.arrays.level_start
-        for first, end in itertools.pairwise(starts):
-            self.launch("coarsen", BLOCKS * (end - first), first=first)
-        for direction, name in enumerate(("warp_lines", "weft_lines")):
-            self.launch("factorize_lines", name, direction=direction)
-            self.launch("factorize_coarse_lines", f"coarse_{name}", direction=direction)
-        if len(starts) > 1:
-            first, end = starts[-2:]
-            self.launch("factorize_coarsest", 1, first=first, count=end - first)
+            _factorize_levels(self)
 
     def solve(self, **replaced: Any) -> None:
-        """The conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
-        a = self.arrays
-        arrays = {name: replaced.get(name, a[name]) for name in SOLVED}
+        """Launch the conjugate gradient on the factorized matrix, with other arrays in place of some of ``SOLVED``."""
+        arrays = {name: replaced.get(name, self.arrays[name]) for name in SOLVED}
+        if self.threads.count > 1:
+            self.threads.solve(arrays)
+        else:
+            self.launch_solve(0, arrays)
+
+    def launch_solve(self, thread: int, arrays: dict[str, Any]) -> None:
+        """Launch the conjugate gradient of one of the threads that share it."""
         kernel = f"{self.preconditioner}_conjugate_gradient"
-        if self.strips == 1:
-            self.launch(kernel, 1, strip=0, most_iterations=self.max_iterations, **arrays)
-            return
-        # helpers were launched with arrays of their own
-        for name, array in arrays.items():
-            self.copy_array(a[f"team_{name}"], array)
-        self._launch_solve(0)
-        for name in ("solution", "euler_solution"):
-            self.copy_array(arrays[name], a[f"team_{name}"])
+        options = {} if self.preconditioner == "jacobi" else {"thread": thread}
+        self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
 
-    def _launch_solve(self, strip: int) -> None:
-        arrays = {name: self.arrays[f"team_{name}"] for name in SOLVED}
-        kernel = f"{self.preconditioner}_conjugate_gradient"
-        self.launch(kernel, 1, strip=strip, most_iterations=self.max_iterations, **arrays)
+    def threads_at_hand(self) -> contextlib.AbstractContextManager[None]:
+        """Keep other processor cores at hand for linear solves, for as long as a block lasts."""
+        return self.threads.at_hand(SOLVED)
 
-    @contextlib.contextmanager
-    def team(self) -> Iterator[None]:
-        """Keeps the other processor cores at hand for linear solves, for as long as a block lasts."""
-        if self.strips == 1:
-            yield
-            return
-        self._team_of(self.strips)
-        team = self.arrays["team"].numpy()  # on the CPU the array itself
-        helpers = []
-        try:
-            for strip in range(1, self.strips):
-                helpers.append(threading.Thread(target=self._launch_solve, args=(strip,), daemon=True))
-                helpers[-1].start()
-                while team[4] != strip and helpers[-1].is_alive():
-                    time.sleep(1e-5)
-            yield
-        finally:
-            team[2] = 1
-            for helper in helpers:
-                helper.join()
-            self._team_of(1)
-
-    def drag_anchor(self, euler: str, anchor: str) -> None:
+    def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
         a = self.arrays
         if a["anchor"] is not None:
-            self.launch("drag_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
+            self.launch("update_anchor", "crossings", euler_next=a[euler], anchor_next=a[anchor])
+
+    def begin_step(self) -> None:
+        """Look at the energy, if it is time to: what every method begins a step with."""
+        self.energy.begin_step()
 
     def end_step(self, *, by_stages: bool = False) -> None:
-        """What every method ends a step with, its end state in place: checks and moves on, and records the frame.
+        """Checks and moves on, and records the frame: what every method ends a step with, its end state in place.
 
         Args:
-            by_stages: whether the method has added up the work of its stages (``add_work``).
+            by_stages: whether the method has added up the work of its stages (``energy.add_work``).
         """
         if self.scene.sliding:
             self.launch("check_order", "segments")
-        if "pin_motion" in self.arrays:
+        if "pins move" in self.arrays.conditions:
             # pins are looked at where they are now, not where they were at the last stage's time
-            self.take_inputs(AT_END)
-        if self.watches:
-            self._close_step(by_stages)
-        self.drag_anchor("euler", "anchor")
+            self.inputs.load(AT_END)
+        self.energy.end_step(by_stages=by_stages)
+        self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
 
-    def add_adjoint_arrays(self) -> None:
-        """Room for the right-hand side of the adjoint solve, and for (u, v) and the anchors at the end of a step."""
-        a, n = self.arrays, self.arrays["nodes"]
-        a["seed"] = a.zeros(n, a.variant.vec3)
-        for name in ("euler_seed", "euler_next"):
-            a[name] = a.zeros(2 * n, a.variant.scalar) if self.scene.sliding else None
-        a["anchor_next"] = None if a["anchor"] is None else a.zeros(2 * n, a.variant.scalar)
 
-    def take_inputs(self, stage: int = 0) -> None:
-        """Puts pins and applied forces of a stage of this step in place, where they change."""
-        a = self.arrays
-        if "applied_force_path" in a:
-            path, values = a["applied_force_path"], a["applied_force"]
-            self.launch("take", len(values), path=path, values=values)
-        if "pin_target_path" in a:
-            arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
-            self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
+def _checked_device(device: Any) -> Any:
+    """Finds a device of Warp."""
+    try:
+        return wp.get_device(device)
+    except Exception as error:
+        names = ", ".join(str(d) for d in wp.get_devices())
+        raise InputError(f"device = {device!r}, must be one of {names}") from error
 
-    def give_inputs(self, name: str, stage: int) -> None:
-        """Adjoint of ``take_inputs`` for one of ``PATHS``."""
-        a = self.arrays
-        gradients = {"values_grad": a[name].grad, "path_grad": a[f"{name}_path"].grad}
-        if name == "applied_force":
-            self.launch("give", len(a[name]), **gradients)
-        else:
-            self.launch("give_back_along", "pins", stage=stage, **gradients)
 
-    # -- energy ------------------------------------------------------------------------------------------------------
-
-    def _add_ledger(self) -> None:
-        """Room for the watch over energy (``kernels/stepping/energy_watch.py``)."""
-        a = self.arrays
-        # the reaction of pins that are moved exactly is nowhere at hand
-        self.watches = not (self.held and self.scene.pin_path is not None)
-        counts = {"energy": 1, "elastic_energy": 1, "height_energy": 1, "power": 2, "stage_work": 1, "bounds": 7}
-        for name, count in counts.items():
-            a[name] = a.zeros(count, a.variant.scalar)
-        for name in ("steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
-            a[name] = a.zeros(1, wp.int32)
-        cloth = self.scene.cloth
-        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
-        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
-        a["still_energy"] = a.numbers(0.5 * mass * STILL**2)
-        if self._outer:
-            a["outer_force"] = a.zeros(a["nodes"], a.variant.vec3)
-        a["gain"] = a.numbers(BLOW_UP if a.variant.reverse else GAIN)
-        self.forget_energy()
-
-    def forget_energy(self) -> None:
-        """Begins to watch anew, from the present state on."""
-        for name, value in (("audit_due", 1), ("alert", 0)):
-            self.arrays.put(name, value)
-        self.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0, 0.0)
-
-    def trust_energy(self) -> None:
-        """Lets all steps pass, until ``forget_energy``: steps that are made again, from the middle of a run, were
-        watched the first time."""
-        a = self.arrays
-        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)
-        a.put("audit_due", 0)
-        a.put("steps_to_audit", np.iinfo(np.int32).max)
-
-    def open_step(self) -> None:
-        """What every method begins a step with: it looks at the energy, if it is time to."""
-        if self.watches:
-            wp.capture_if(self.arrays["audit_due"], on_true=self._audit)
-
-    def _audit(self) -> None:
-        if "pin_motion" in self.arrays:
-            self.take_inputs(AT_START)
-        self.press()
-        self.arrays.zero("energy", "elastic_energy", "height_energy")
-        self._add_energies(cheap=True)
-        self._add_energies(cheap=False)
-        if self._outer:
-            self._add_outer_forces("outer_force")
-        self.launch("audit", 1)
-
-    def _add_energies(self, *, cheap: bool) -> None:
-        """Energy of the terms that are watched at every step, or of the others."""
-        for term in self.arrays.terms:
-            if term.energy is not None and bool(term.energy_watched_as) == cheap:
-                energy = self.arrays[term.energy_watched_as or "energy"]
-                self.launch(f"{term.name}_energy", term.elements, energy=energy)
-
-    def begin_work(self) -> None:
-        """Begins to add up the work done in a step."""
-        self.arrays.zero("stage_work")
-
-    def add_work(self, share: float) -> None:
-        """Adds the work that is done at the present state in a share of the step."""
-        if self.watches:
-            self._add_powers()
-            self.launch("add_work", 1, share=share)
-
-    @property
-    def _outer(self) -> list[Term]:
-        """Terms that do work on the cloth and have no energy."""
-        return [term for term in self.arrays.terms if term.works]
-
-    def _add_outer_forces(self, target: str) -> None:
-        """Fills an array with outer forces at the present state."""
-        a = self.arrays
-        a.zero(target)
-        for term in self._outer:
-            self.launch(term.name, term.elements, matrix=0, press=0, force=a[target])
-
-    def _add_powers(self) -> None:
-        """The power of outer forces and of moving pins at the present state."""
-        a = self.arrays
-        a.zero("power")
-        if self._outer:
-            # the forces go where the solver works
-            self._add_outer_forces("q_x")
-            self.launch("add_power", "nodes", force=a["q_x"])
-        if "pin_motion" in a and any(term.name == "pins" for term in a.terms):
-            self.launch("add_pin_power", "pins", step_duration=self.step_size)
-
-    def _close_step(self, by_stages: bool) -> None:
-        """Compares the energy at the end of a step with the work done in it."""
-        a = self.arrays
-        a.zero("energy", "elastic_energy", "height_energy")
-        self._add_energies(cheap=True)
-        self.launch("suspect", 1)
-        wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
-        self._add_powers()
-        self.launch("close_step", 1, by_stages=int(by_stages))
-        if self._outer:
-            self.launch("keep_outer_force", "nodes", force=a["q_x"])
+def _factorize_levels(model: Model) -> None:
+    """Factorizes lines and coarse levels, from the cloth up."""
+    starts = model.arrays.level_start
+    for first, end in itertools.pairwise(starts):
+        model.launch("coarsen", BLOCKS * (end - first), first=first)
+    for direction, name in enumerate(("warp_lines", "weft_lines")):
+        model.launch("factorize_lines", name, along=direction)
+        model.launch("factorize_coarse_lines", f"coarse_{name}", along=direction)
+    if len(starts) > 1:
+        first, end = starts[-2:]
+        model.launch("factorize_coarsest", 1, first=first, count=end - first)

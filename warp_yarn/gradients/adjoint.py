@@ -10,10 +10,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import warp as wp
 
+from ..device import declarations
 from ..device.arrays import STATE_TYPES
-from ..device.model import PATHS
+from ..device.declared import arrays_of
+from ..device.inputs import PATHS
 from ..errors import GradientError, InputError
 from ..kernels.core.status import NOT_FINITE
 from ..simulation.simulator import Simulator
@@ -36,11 +37,8 @@ class Adjoint:
         self.moving = [name for name in PATHS if name in parameters and f"{name}_path" in a]
         self.wanted = (*STATE_TYPES, *parameters, *(f"{name}_path" for name in self.moving))
         a.require_grad(*self.wanted)
-        for name in STATE_TYPES:
-            # of the loss, by frame of a chunk; (u, v) has one even where it does not change: it may be an input
-            if f"loss_{name}" not in a:
-                array, frames = a[name], simulator.chunk + 1
-                a[f"loss_{name}"] = None if array is None else a.zeros(frames * array.shape[0], array.dtype)
+        # (u, v) has one even where it does not change: it may be an input
+        a.make(declarations.LOSS)
         self._prepared: list[Any] = []
         self._prepare(simulator.integrator)
 
@@ -53,12 +51,12 @@ class Adjoint:
     def _add_loss_gradient(self) -> None:
         """Adds what the loss asks of the present frame to the running adjoints."""
         frames = {f"frame_{name}_grad": self.arrays[f"loss_{name}"] for name in STATE_TYPES}
-        self.simulator.model.launch("receive", "nodes", **frames)
+        self.simulator.model.launch("add_loss_gradient", "nodes", **frames)
 
     def _scatter_gradient(self, stage: int) -> None:
         """Adds what a stage gave to inputs that change from step to step to the rows of their paths."""
         for name in self.moving:
-            self.simulator.model.give_inputs(name, stage)
+            self.simulator.model.inputs.scatter_gradient(name, stage)
 
     def release(self) -> None:
         """Gives the gradients of parameters up, before another one asks for other parameters."""
@@ -82,9 +80,9 @@ class Adjoint:
             GradientError: where an adjoint is not finite, or its solve does not converge.
         """
         self.arrays.put("counters", steps, before + first + steps)
-        with self.simulator.model.team():
+        with self.simulator.model.threads_at_hand():
             for k in range(steps, 0, -1):
-                self._retreat(self.simulator.integrator, first + k)
+                self._backward(self.simulator.integrator, first + k)
 
     def backward_part(self, method: Any, size: float, left: float, step: int, before: int = 0) -> None:
         """Goes back over a part of a step, from its end, frame 1 on the device, to its start, frame 0.
@@ -106,15 +104,15 @@ class Adjoint:
         try:
             method.set_times(size * h, left * h)
             self.arrays.put("counters", 1, before + step)
-            with self.simulator.model.team():
-                self._retreat(method, step)
+            with self.simulator.model.threads_at_hand():
+                self._backward(method, step)
         finally:
             self.simulator.integrator.set_times(h, h)
         self.arrays.zero(*(f"loss_{name}" for name in STATE_TYPES))
 
-    def _retreat(self, method: Any, step: int) -> None:
+    def _backward(self, method: Any, step: int) -> None:
         """Goes back over what ends at the present frame."""
-        method.retreat()
+        method.backward_step()
         if self.arrays["status"].numpy()[0]:
             self._fail(method, step)
 
@@ -154,7 +152,7 @@ class Adjoint:
     def _blame(self, method: Any) -> str | None:
         """Finds the kernel whose reverse first writes what is not finite, in the step that is on the device."""
         for launch in reversed(method.tape.launches):
-            gradients = [array.grad for array in launch[3] if isinstance(array, wp.array) and array.grad is not None]
+            gradients = [array.grad for array in arrays_of(launch) if array.grad is not None]
             if any(not np.isfinite(gradient.numpy()).all() for gradient in gradients):
                 return launch[0].key
         return None

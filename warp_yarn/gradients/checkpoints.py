@@ -90,7 +90,7 @@ class Checkpoints:
             flat(simulator.arrays[name]).copy_(state)
         simulator.steps_done = steps_done + first
         # after the number of steps, which begins to watch anew
-        simulator.model.trust_energy()
+        simulator.model.energy.trust()
         made = simulator.run_chunk(steps)
         again = [k - steps_done for k in simulator.split_steps]
         if made < steps or again:

@@ -1,7 +1,8 @@
 """Time integration: one method a file, each with its step and the adjoint of its step side by side.
 
 A method is a class that says its ``name``, ``order`` and, in its docstring, its stability; ``advance`` makes a step of
-the model's state arrays; ``prepare_adjoint`` and ``retreat`` are its reverse (``linear.py`` says what they leave).
+the model's state arrays; ``prepare_adjoint`` and ``backward_step`` are its reverse (``linear.py`` says
+what they leave).
 """
 
 from typing import Any

@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 import warp as wp
 
-from ..device.model import BETWEEN, MATRIX, Graphs, Model
+from ..device import declarations
+from ..device.graphs import GraphCache
+from ..device.model import BETWEEN, MATRIX, Model
 
 
 class LinearlyImplicitEuler:
@@ -23,10 +25,10 @@ class LinearlyImplicitEuler:
 
     def __init__(self, model: Model):
         self.model = model
-        self._graphs = Graphs(model.device)
+        self._graphs = GraphCache(model.device)
 
     def set_times(self, step: float, remaining: float) -> None:
-        """As of Model.set_times."""
+        """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         self.model.set_times(step, remaining, step)
 
     def advance(self) -> None:
@@ -35,12 +37,12 @@ class LinearlyImplicitEuler:
 
     def _step(self) -> None:
         model = self.model
-        model.open_step()
-        model.take_inputs()
+        model.begin_step()
+        model.inputs.load()
         model.assemble()
         # The last velocity is the start: a step changes it little.
         model.copy(solution="velocity", euler_solution="euler_velocity")
-        model.prescribe()
+        model.set_pin_velocity()
         model.factorize()
         model.solve()
         model.launch("advance", "nodes")
@@ -55,8 +57,7 @@ class LinearlyImplicitEuler:
             before, after: launch what a run has to do with adjoints before every step, and after every stage of it.
         """
         model, a = self.model, self.model.arrays
-        if "seed" not in a:
-            model.add_adjoint_arrays()
+        a.make(declarations.ADJOINT)
         a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
         if model.scene.sliding:
             # s⁺ is the end of the step for friction's anchor too: one running adjoint
@@ -65,41 +66,41 @@ class LinearlyImplicitEuler:
         with self.tape:
             self._record()
         with self.anchor_tape:
-            model.drag_anchor("euler_next", "anchor_next")
+            model.update_anchor("euler_next", "anchor_next")
         self._around = before, after
         self._graphs.pop("backward", None)
 
     def _record(self) -> None:
         self.model.assemble()
-        self.model.prescribe()
+        self.model.set_pin_velocity()
 
-    def retreat(self) -> None:
+    def backward_step(self) -> None:
         """Goes back over the step that ends at the present frame.
 
         Before, the gradients of the state's arrays hold the adjoint of the step's end; after, that of its beginning,
         and those of parameters have gained the step's part.
         """
-        self._graphs.run("backward", self._retreat)
+        self._graphs.run("backward", self._backward_step)
 
-    def _retreat(self) -> None:
+    def _backward_step(self) -> None:
         before, after = self._around
         before()
         self._reverse()
         after(0)
 
     def _reverse(self) -> None:
-        self._recall()
+        self._restore()
         self.model.assemble()
         self._reverse_anchors()
         self.model.launch("adjoint_right_hand_side", "nodes")
         self._solve()
         self.tape.backward()
 
-    def _recall(self) -> None:
-        """The state that the step started from."""
+    def _restore(self) -> None:
+        """Restores the state that the step started from."""
         self.model.launch("count", 1, by=-1)
-        self.model.launch("recall", "nodes")
-        self.model.take_inputs()
+        self.model.launch("restore_frame", "nodes")
+        self.model.inputs.load()
 
     def _reverse_anchors(self) -> None:
         """Takes friction's anchors back, first of all that the adjoints of an assembly gather."""
@@ -111,14 +112,14 @@ class LinearlyImplicitEuler:
             self.anchor_tape.backward()
 
     def _solve(self) -> None:
-        """λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
+        """Solves for λ, in the gradient of the right-hand side, and from it Ā and the adjoint of what is held."""
         model, a = self.model, self.model.arrays
         model.factorize()
         multiplier = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
-        model.solve(rhs=a["seed"], euler_rhs=a["euler_seed"], **multiplier)
-        if model.held:
+        model.solve(rhs=a["adjoint_rhs"], euler_rhs=a["euler_adjoint_rhs"], **multiplier)
+        if model.has_hard_pins:
             a.zero("q_x", "q_s")
             a.zero_grad("solution")
             model.launch("apply_matrix", 1, p_x=a["rhs"].grad, p_s=a.find("euler_rhs_grad"))
-            model.launch("held_adjoint", "pins")
+            model.launch("hard_pin_adjoint", "pins")
         model.launch("matrix_adjoint", "nodes")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import warp as wp
 
+from ..device import declarations
 from ..device.model import BETWEEN, MATRIX, Model
 from ..kernels.stepping.ros2 import GAMMA
 from .linear import LinearlyImplicitEuler
@@ -43,33 +44,30 @@ class ROS2(LinearlyImplicitEuler):
 
     def __init__(self, model: Model):
         super().__init__(model)
-        a = model.arrays
-        for name in ("first_solution", "increment"):
-            a[name] = a.zeros(a["nodes"], a.variant.vec3)
-            a[f"euler_{name}"] = a.zeros(2 * a["nodes"], a.variant.scalar) if model.scene.sliding else None
-        a["stage_size"] = a.zeros(1, a.variant.scalar)
-        self._explicit = tuple(term.name for term in a.terms if term.explicit_in_ros2)
+        self._explicit = tuple(term.name for term in model.arrays.terms if term.explicit_in_ros2)
+        model.arrays.make(declarations.STAGES)
+        model.arrays.make(declarations.FIRST_STAGE)
         self.set_times(model.step_size, model.step_size)
 
     def set_times(self, step: float, remaining: float) -> None:
-        """As of Model.set_times."""
+        """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         self.model.set_times(step, remaining, GAMMA * step, (GAMMA, 1.0 - GAMMA))
         self.model.arrays.put("stage_size", GAMMA * step)
 
     def _step(self) -> None:
         model, a = self.model, self.model.arrays
         first = {"solution": a["first_solution"], "euler_solution": a["euler_first_solution"]}
-        model.open_step()
-        model.take_inputs()
+        model.begin_step()
+        model.inputs.load()
         self._assemble_first()
         model.copy(first_solution="velocity", euler_first_solution="euler_velocity")
-        model.prescribe(solution=a["first_solution"])
+        model.set_pin_velocity(solution=a["first_solution"])
         model.factorize()
         model.solve(**first)
         model.launch("enter_second_stage", "nodes", start=a["solution"], euler_start=a["euler_solution"])
         if model.scene.sliding:
             model.launch("check_order", "segments")
-        model.take_inputs(1)
+        model.inputs.load(1)
         self._assemble_second()
         model.factorize()
         model.solve()
@@ -89,11 +87,9 @@ class ROS2(LinearlyImplicitEuler):
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
-        """As of LinearlyImplicitEuler."""
-        model, a = self.model, self.model.arrays
-        if "stage_adjoint" not in a:
-            a["stage_adjoint"] = a.zeros(a["nodes"], a.variant.vec3)
-            a["euler_stage_adjoint"] = a.zeros(2 * a["nodes"], a.variant.scalar) if model.scene.sliding else None
+        """Makes room for the adjoints within a step, and records what the tape reverses."""
+        a = self.model.arrays
+        a.make(declarations.CARRIED_ADJOINT)
         a.require_grad(*BETWEEN, *MATRIX, "rhs", "euler_rhs", "increment", "euler_increment", "euler_first_solution")
         self.second_tape = wp.Tape()
         with self.second_tape:
@@ -102,13 +98,13 @@ class ROS2(LinearlyImplicitEuler):
 
     def _record(self) -> None:
         self._assemble_first()
-        self.model.prescribe()
+        self.model.set_pin_velocity()
 
     def _reverse(self) -> None:
         model, a = self.model, self.model.arrays
-        self._recall()
-        model.take_inputs(1)
-        model.launch("recall_both_stages", "nodes")
+        self._restore()
+        model.inputs.load(1)
+        model.launch("restore_both_stages", "nodes")
         model.launch("enter_second_stage", "nodes", start=None, euler_start=None)
         self._assemble_second()
         self._reverse_anchors()
@@ -119,10 +115,13 @@ class ROS2(LinearlyImplicitEuler):
         _, after = self._around
         after(1)
 
-        model.launch("recall", "nodes")
-        model.take_inputs()
+        model.launch("restore_frame", "nodes")
+        model.inputs.load()
         self._assemble_first()
         a.zero_grad(*BETWEEN)
         model.launch("first_stage_adjoint", "nodes")
+        # λ starts at 0, and w is that of the first stage
+        a.zero_grad("rhs", "euler_rhs")
+        model.copy(solution="first_solution", euler_solution="euler_first_solution")
         self._solve()
         self.tape.backward()

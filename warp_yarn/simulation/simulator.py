@@ -19,7 +19,8 @@ import warp as wp
 from ..description.scene import Scene
 from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
-from ..device.model import Graphs, Model
+from ..device.graphs import GraphCache
+from ..device.model import Model
 from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
@@ -169,7 +170,7 @@ class Simulator:
                 threads=threads,
                 differentiable=differentiable,
             )
-            self.model.watches = self.model.watches and bool(energy_watch)
+            self.model.energy.on = self.model.energy.on and bool(energy_watch)
             refuse_recording(self.model.device)
             self._options["device"] = str(self.model.device)
             self.scene, self.arrays, self.step_size = scene, self.model.arrays, self.model.step_size
@@ -181,7 +182,7 @@ class Simulator:
             self.parts = Parts(self.model, self.integrator, allowed, fallback)
             self.chunk = _checked_chunk(chunk, scene.cloth.nodes)
             self.arrays.add_frames(self.chunk + 1)
-            self._graphs = Graphs(self.model.device)
+            self._graphs = GraphCache(self.model.device)
             self._steps_done = 0
             self.split_steps: dict[int, float] = {}
             self.damped_steps: set[int] = set()
@@ -263,7 +264,7 @@ class Simulator:
         if self._recording is not None:
             self._recording.open = False
         # pins may be elsewhere then, which is no gain of energy
-        self._owed = self.model.forget_energy
+        self._owed = self.model.energy.forget
         self._pay()
         self._steps_done = steps
 
@@ -286,7 +287,7 @@ class Simulator:
 
         def begin() -> None:
             self._upload(state)
-            self.model.forget_energy()
+            self.model.energy.forget()
             self.parts.size = 1.0
             if steps_done is not None:
                 self._steps_done, self.split_steps, self.damped_steps = steps_done, {}, set()
@@ -387,8 +388,8 @@ class Simulator:
                 with ALONE, compiling():
                     refuse_recording(self.model.device)
                     self._settle()
-                    if self.model.strips > 1:
-                        uninterrupted(lambda: self._team.enter_context(self.model.team()))
+                    if self.model.threads.count > 1:
+                        uninterrupted(lambda: self._team.enter_context(self.model.threads_at_hand()))
                 return self._make_chunk(steps)
             finally:
                 self._end_team()
@@ -415,7 +416,7 @@ class Simulator:
         return made
 
     def _end_team(self) -> None:
-        if self.model.strips > 1:
+        if self.model.threads.count > 1:
             uninterrupted(self._team.close)
 
     def _count(self, frame: int) -> None:
@@ -583,7 +584,7 @@ class Simulator:
         a, nodes, result = self.arrays, self.scene.cloth.nodes, {}
         crossing = np.repeat(self.scene.cloth.topology.is_crossing != 0, 2)
         with _Visit(self, state):
-            self.model.press()
+            self.model.add_contact_load()
             total = np.zeros(2 * nodes)
             for term in a.terms:
                 if term.name == "mass":
@@ -591,7 +592,7 @@ class Simulator:
                 a.zero("force", "euler_force", "friction_force_out")
                 if term.reads_forces:
                     a["euler_force"].assign(total)
-                self.model.launch(term.name, term.elements, matrix=0, press=0)
+                self.model.launch_term(term, matrix=0, add_contact_load=0)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"
                 along = np.zeros(2 * nodes)
                 if a[out] is not None:
@@ -607,7 +608,7 @@ class Simulator:
         if not self.arrays.contact:
             raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
         with _Visit(self, state):
-            self.model.press()
+            self.model.add_contact_load()
             load = self.arrays["contact_load"].numpy().astype(np.float64)
             return self.arrays["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
 
@@ -616,7 +617,7 @@ class Simulator:
         """Energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.arrays, {}
         with _Visit(self, state):
-            self.model.press()
+            self.model.add_contact_load()
             energy = a.zeros(1, a.variant.scalar)
             for term in a.terms:
                 if term.energy is not None:
@@ -635,7 +636,7 @@ class Simulator:
         """
         h = self.step_size
         with _Visit(self, state, ahead=True):
-            self.arrays.put("weights", *(weights or (1.0, h, h * h)))
+            self.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return gather(self.model)
 
@@ -667,7 +668,7 @@ class _Visit:
         simulator.arrays.put("counters", 0, self.row)
         # before the first step, pins are where they start
         simulator.arrays.put("stage_times", *[float(self.ahead or simulator._steps_done > 0)] * 4)
-        simulator.model.take_inputs()
+        simulator.model.inputs.load()
         if self.visited is not None:
             simulator._upload(self.visited)
 

@@ -11,7 +11,8 @@ from typing import Any
 
 from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE
-from ..device.model import Graphs, Model
+from ..device.graphs import GraphCache
+from ..device.model import Model
 from ..kernels.core.status import GAINED, INACCURATE
 
 SMALLEST = 2.0**-7
@@ -49,7 +50,7 @@ class Parts:
         self._fallback: Any = None
         self.watcher: Callable[[Any, float, float], None] | None = None
         self.reset()
-        self._graphs = Graphs(model.device)
+        self._graphs = GraphCache(model.device)
 
     def reset(self) -> None:
         """Begins anew, as for another motion."""
@@ -68,7 +69,7 @@ class Parts:
         """
         done, smallest = 0.0, 1.0
         # what a rejected part has put by is put back, but an account that it opened
-        self._graphs.run("open", self.model.open_step)
+        self._graphs.run("open", self.model.begin_step)
         least = SMALLEST if self.allowed is None else SMALLEST_CONTROLLED
         while done < 1.0:
             left = 1.0 - done

@@ -1,0 +1,132 @@
+"""Arrays that kernels take together, as one argument.
+
+A field is found by its name, as an argument is (``warp_yarn/device/declared.py``), at every launch anew: Warp keeps what
+an array and its gradient were when it was put into a struct. What a scene does not have is an array of no length.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .variant import Variant
+
+
+@functools.cache
+def structs(variant: Variant) -> SimpleNamespace:
+    """Make the structs of a variant: BlockMatrix, SolverWork, SolveReport, NewtonControl, StateAdjoint and Levels."""
+    scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
+
+    @wp.struct
+    class BlockMatrix:
+        """The matrix (``linear/block_matrix.py`` tells its layout), and what M, D and H are multiplied by in it."""
+
+        stencil: int
+        neighbour: wp.array(dtype=int)
+        coefficients: wp.array(dtype=vec3)
+        diagonal_xx: wp.array(dtype=mat33)
+        diagonal_xs: wp.array(dtype=vec3)
+        diagonal_ss: wp.array(dtype=scalar)
+        upper_xx: wp.array(dtype=mat33)
+        upper_xs: wp.array(dtype=vec3)
+        upper_sx: wp.array(dtype=vec3)
+        upper_ss: wp.array(dtype=scalar)
+
+    @wp.struct
+    class SolverWork:
+        """Vectors that a conjugate gradient works with, and a place for the sums of its threads."""
+
+        r_x: wp.array(dtype=vec3)
+        r_s: wp.array(dtype=scalar)
+        p_x: wp.array(dtype=vec3)
+        p_s: wp.array(dtype=scalar)
+        q_x: wp.array(dtype=vec3)
+        q_s: wp.array(dtype=scalar)
+        t_x: wp.array(dtype=vec3)
+        t_s: wp.array(dtype=scalar)
+        sums: wp.array(dtype=scalar)
+
+    @wp.struct
+    class SolveReport:
+        """How a linear solve ended."""
+
+        iterations: wp.array(dtype=int)
+        residual: wp.array(dtype=scalar)
+        status: wp.array(dtype=int)
+
+    @wp.struct
+    class NewtonControl:
+        """What Newton's iteration remembers from one evaluation to the next, and what it decided."""
+
+        shortest: wp.array(dtype=scalar)
+        newton_tolerance: wp.array(dtype=scalar)
+        last_norm: wp.array(dtype=scalar)
+        contraction: wp.array(dtype=scalar)
+        kinetic: wp.array(dtype=scalar)
+        change: wp.array(dtype=scalar)
+        first_change: wp.array(dtype=scalar)
+        directional_derivative: wp.array(dtype=scalar)
+        step_length: wp.array(dtype=scalar)
+        residual_norm: wp.array(dtype=scalar)
+        evaluations: wp.array(dtype=int)
+        steps: wp.array(dtype=int)
+        iterate: wp.array(dtype=int)
+        take_unchecked_step: wp.array(dtype=int)
+        new_direction: wp.array(dtype=int)
+        rebuild_matrix: wp.array(dtype=int)
+        newton_iterations: wp.array(dtype=int)
+
+    @wp.struct
+    class StateAdjoint:
+        """Running adjoints of the state: gradients of its arrays."""
+
+        position_grad: wp.array(dtype=vec3)
+        euler_grad: wp.array(dtype=scalar)
+        velocity_grad: wp.array(dtype=vec3)
+        euler_velocity_grad: wp.array(dtype=scalar)
+
+    @wp.struct
+    class Levels:
+        """Index arrays of ``warp_yarn.description.levels.Levels``, and the preconditioner's numbers."""
+
+        coarse_levels: int
+        blocks_per_node: int
+        warp_lines: int
+        coarse_warp_lines: int
+        exact: int
+        line_start: wp.array(dtype=int)
+        line_node: wp.array(dtype=int)
+        lower: wp.array(dtype=int)
+        level_start: wp.array(dtype=int)
+        coarse_line_start: wp.array(dtype=int)
+        coarse_line_node: wp.array(dtype=int)
+        parent: wp.array(dtype=int)
+        parent_weight: wp.array(dtype=scalar)
+        child_start: wp.array(dtype=int)
+        child: wp.array(dtype=int)
+        child_weight: wp.array(dtype=scalar)
+        block_start: wp.array(dtype=int)
+        part: wp.array(dtype=int)
+        part_weight: wp.array(dtype=scalar)
+        coarsest_slot: wp.array(dtype=int)
+        # numbers: matrices of the coarse levels, factors of all lines, ½ D⁻¹ of both lines of a node, the last level
+        coarse_block: wp.array(dtype=mat33)
+        line_factor: wp.array(dtype=scalar)
+        coarse_line_factor: wp.array(dtype=scalar)
+        halves: wp.array(dtype=sym33)
+        coarse_halves: wp.array(dtype=sym33)
+        coarsest: wp.array(dtype=scalar)
+        # work space
+        line_work: wp.array(dtype=scalar)
+        coarse_line_work: wp.array(dtype=scalar)
+        coarse_r: wp.array(dtype=vec3)
+        coarse_z: wp.array(dtype=vec3)
+
+    return SimpleNamespace(
+        BlockMatrix=BlockMatrix,
+        SolverWork=SolverWork,
+        SolveReport=SolveReport,
+        NewtonControl=NewtonControl,
+        StateAdjoint=StateAdjoint,
+        Levels=Levels,
+    )

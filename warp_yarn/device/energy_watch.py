@@ -1,0 +1,126 @@
+"""The watch over a model's energy: the host's side of ``kernels/stepping/energy_watch.py``."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from ..kernels import Term
+from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
+from . import declarations
+
+if TYPE_CHECKING:
+    from .model import Model
+
+AT_END, AT_START = 2, 3
+"""The places of a step's end and start among ``stage_times``, behind those of two stages."""
+
+
+class EnergyWatch:
+    """Compares the energy at the end of every step with what there was and the work that was done.
+
+    Attributes:
+        on: whether it does; where pins are moved exactly, their reaction is nowhere at hand.
+    """
+
+    def __init__(self, model: Model):
+        self.model = model
+        a = model.arrays
+        # the reaction of pins that are moved exactly is nowhere at hand
+        self.on = not (model.has_hard_pins and model.scene.pin_path is not None)
+        a.make(declarations.ENERGY_WATCH)
+        cloth = model.scene.cloth
+        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
+        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
+        a.put("still_energy", 0.5 * mass * STILL**2)
+        if self._outer:
+            a.make(declarations.OUTER_FORCES)
+        a.put("gain", BLOW_UP if a.variant.reverse else GAIN)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begins to watch anew, from the present state on."""
+        for name, value in (("audit_due", 1), ("alert", 0)):
+            self.model.arrays.put(name, value)
+        self.model.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0, 0.0)
+
+    def trust(self) -> None:
+        """Lets all steps pass, until ``forget``: steps that are made again, from the middle of a run, were
+        watched the first time."""
+        a = self.model.arrays
+        a.put("bounds", math.inf, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)
+        a.put("audit_due", 0)
+        a.put("steps_to_audit", np.iinfo(np.int32).max)
+
+    def begin_step(self) -> None:
+        """Looks at all energies, if it is time to."""
+        if self.on:
+            wp.capture_if(self.model.arrays["audit_due"], on_true=self._audit)
+
+    def _audit(self) -> None:
+        if "pins move" in self.model.arrays.conditions:
+            self.model.inputs.load(AT_START)
+        self.model.add_contact_load()
+        self.model.arrays.zero("energy", "elastic_energy", "height_energy")
+        self._add_energies(cheap=True)
+        self._add_energies(cheap=False)
+        if self._outer:
+            self._add_outer_forces("outer_force")
+        self.model.launch("audit", 1)
+
+    def _add_energies(self, *, cheap: bool) -> None:
+        """Adds up the energy of the terms that are watched at every step, or of the others."""
+        for term in self.model.arrays.terms:
+            if term.energy is not None and bool(term.energy_watched_as) == cheap:
+                energy = self.model.arrays[term.energy_watched_as or "energy"]
+                self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
+
+    def begin_work(self) -> None:
+        """Begins to add up the work done in a step."""
+        self.model.arrays.zero("stage_work")
+
+    def add_work(self, share: float) -> None:
+        """Adds the work that is done at the present state in a share of the step."""
+        if self.on:
+            self._add_powers()
+            self.model.launch("add_work", 1, share=share)
+
+    @property
+    def _outer(self) -> list[Term]:
+        """Finds the terms that do work on the cloth and have no energy."""
+        return [term for term in self.model.arrays.terms if term.works]
+
+    def _add_outer_forces(self, target: str) -> None:
+        """Fills an array with outer forces at the present state."""
+        a = self.model.arrays
+        a.zero(target)
+        for term in self._outer:
+            self.model.launch_term(term, matrix=0, add_contact_load=0, force=a[target])
+
+    def _add_powers(self) -> None:
+        """Adds up the power of outer forces and of moving pins at the present state."""
+        a = self.model.arrays
+        a.zero("power")
+        if self._outer:
+            # the forces go where the solver works
+            self._add_outer_forces("q_x")
+            self.model.launch("add_power", "nodes", force=a["q_x"])
+        if "pins move" in a.conditions and any(term.name == "pins" for term in a.terms):
+            self.model.launch("add_pin_power", "pins", step_duration=self.model.step_size)
+
+    def end_step(self, *, by_stages: bool) -> None:
+        """Compares the energy at the end of a step with the work done in it."""
+        if not self.on:
+            return
+        a = self.model.arrays
+        a.zero("energy", "elastic_energy", "height_energy")
+        self._add_energies(cheap=True)
+        self.model.launch("suspect", 1)
+        wp.capture_if(a["looks_closely"], on_true=lambda: self._add_energies(cheap=False))
+        self._add_powers()
+        self.model.launch("close_step", 1, by_stages=int(by_stages))
+        if self._outer:
+            self.model.launch("keep_outer_force", "nodes", force=a["q_x"])

@@ -1,0 +1,64 @@
+"""What a declaration says of an array, and the conditions under which a scene has it."""
+
+import dataclasses
+from typing import Any
+
+import warp as wp
+
+from ..description.scene import Scene
+from ..kernels import Term, Variant, own
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """Declares an array.
+
+    Args:
+        element: what it has an entry of: a key of ``Arrays.sizes``, "count" of a number that all launches share, or
+            "launch" of what a launch says itself.
+        count: how many to an element.
+        kind: its type: "scalar" (of the variant), "int", "vec3", "mat33", "sym33", "vec3i", "vec4i"; "any" of what
+            stands for one array or another.
+        unit: SI, "" of what has none.
+        when: the condition of the scene under which it is there.
+        meaning: what it is.
+    """
+
+    element: str
+    count: int
+    kind: str
+    unit: str
+    when: str
+    meaning: str
+
+    def dtype(self, variant: Variant) -> Any:
+        """Find the Warp type of an entry."""
+        fixed = {"int": wp.int32, "vec3i": wp.vec3i, "vec4i": wp.vec4i}
+        return fixed[self.kind] if self.kind in fixed else getattr(variant, self.kind)
+
+
+Group = dict[str, Field]
+
+
+def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
+    """Find the conditions that hold for a scene, which ``Field.when`` names."""
+    names = {term.name for term in terms}
+    # which may read any index array
+    others = any(not own(term) for term in terms)
+    holds = {
+        "always": True,
+        "sliding": variant.sliding,
+        "contact": any(term.needs_contact for term in terms),
+        "friction": "friction" in names,
+        "shear": "shear" in names or others,
+        "wind": "wind" in names or others,
+        "has gravity": scene.gravity is not None,
+        "has wind": scene.wind is not None,
+        "has pins": len(scene.pins) > 0,
+        "hard pins": len(scene.pins) > 0 and scene.pin_stiffness is None,
+        "spring pins": len(scene.pins) > 0 and scene.pin_stiffness is not None,
+        "pins move": scene.pin_path is not None,
+        "has forces": len(scene.force_nodes) > 0,
+        "forces change": len(scene.force_nodes) > 0 and len(scene.force_path) > 1,
+    }
+    return {name for name, value in holds.items() if value}

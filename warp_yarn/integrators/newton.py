@@ -1,0 +1,107 @@
+"""Newton's iteration on an implicit stage: the host's side of ``kernels/nonlinear``."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ..device import declarations
+from ..device.model import Model
+
+INNER_TOLERANCE = 1e-2
+"""Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
+would not come nearer to the stage's."""
+INNER_TOLERANCE_FREE = 1e-3
+"""The same of a cloth that nothing holds: what is left of its momentum adds up from step to step."""
+
+
+class Newton:
+    """Solves the stages of a model, one after the other.
+
+    The iteration ends with the step that leaves less than newton_tolerance of the change of velocity, by what the steps
+    before it left: looking at where it led would only confirm it (``check_convergence`` in
+    ``kernels/nonlinear/newton.py``, ``docs/solver.md``). Along δ it takes a full step unless that overshoots: r·δ is
+    minus the slope of the energy that a stage minimizes, where there is one, and must not turn to more than 0.9 of
+    itself with the other sign, or else ‖r‖ must fall. (That it always falls is too much to ask of yarns that buckle.)
+    Nor may crossings change their order.
+    """
+
+    def __init__(self, model: Model):
+        self.model = model
+        a = model.arrays
+        a.make(declarations.STAGES)
+        if "base_position" not in a:  # two methods may work on one model, one after the other
+            a.make(declarations.NEWTON_WORKSPACE)
+            a.put("unit", 1.0)
+            a.put("step_length", 1.0)
+            a.put("shortest", 1e30)
+            a.put("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE)
+
+    def evaluate(self, *, matrix: bool) -> None:
+        """Computes the residual at w, and the matrix if asked for."""
+        self.model.launch("enter_stage", "nodes")
+        self.assemble(matrix=matrix)
+        if matrix:
+            self.model.factorize()
+
+    def assemble(self, *, matrix: bool) -> None:
+        a = self.model.arrays
+        mass = {"velocity": a["increment"], "euler_velocity": a["euler_increment"]}
+        self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
+
+    def solve(self, stage: int) -> None:
+        """Solves a stage. Its matrix is that of its start until convergence is slow: another state's differs less
+        from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
+        turn."""
+        a = self.model.arrays
+        a.zero("evaluations", "steps", "direction", "euler_direction")
+        if self.model.scene.sliding:
+            a.zero("order_would_be_lost")
+            self.model.launch("check_initial_guess", "segments")
+            wp.capture_if(a["order_would_be_lost"], on_true=lambda: a.zero("euler_solution"))
+        if stage == 0:
+            self.evaluate(matrix=True)
+        else:
+            self._evaluate_as_asked()
+        self._control()
+        wp.capture_while(a["iterate"], lambda: self._iterate(stage))
+
+    def _evaluate_as_asked(self) -> None:
+        wp.capture_if(
+            self.model.arrays["rebuild_matrix"],
+            on_true=lambda: self.evaluate(matrix=True),
+            on_false=lambda: self.evaluate(matrix=False),
+        )
+
+    def _control(self) -> None:
+        if self.model.scene.sliding:
+            self.model.launch("shortest_segment", "segments")
+        self.model.launch("control_newton", 1)
+
+    def _iterate(self, stage: int) -> None:
+        a = self.model.arrays
+        a.zero("take_unchecked_step")
+        wp.capture_if(a["new_direction"], on_true=lambda: self.solve_direction(stage))
+        self.model.launch("apply_step", "nodes")
+        wp.capture_if(a["take_unchecked_step"], on_true=self._finish_stage, on_false=self._check)
+
+    def _finish_stage(self) -> None:
+        """Ends with the last step, without a look at where it led."""
+        self.model.launch("enter_stage", "nodes")
+        self.model.arrays.zero("iterate")
+
+    def _check(self) -> None:
+        self._evaluate_as_asked()
+        self._control()
+
+    def solve_direction(self, stage: int) -> None:
+        """Solves for δ, from A δ = r."""
+        a = self.model.arrays
+        a.zero("direction", "euler_direction")
+        if not len(self.model.scene.pins):
+            self.model.launch("start_rigid", 1)
+        self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
+        self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
+        self.model.launch("begin_line_search", 1)
+        if self.model.scene.sliding:
+            self.model.launch("limit_step_length", "segments")
+        self.model.launch("check_convergence", 1, stage=stage)
