@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, indices, number
+from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS
 from .cloth import Cloth, Fixed
 
@@ -32,8 +32,8 @@ class Wind:
         # copies: an array that the caller writes to again is not this wind
         keep = functools.partial(object.__setattr__, self)
         keep("velocity", tuple(finite_array("wind velocity", self.velocity, (3,)).tolist()))
-        keep("density", number("wind density", self.density, least=0.0))
-        keep("drag", number("wind drag", self.drag, least=0.0))
+        keep("density", real("wind density", self.density, least=0.0))
+        keep("drag", real("wind drag", self.drag, least=0.0))
 
 
 class Scene(Fixed):
@@ -78,7 +78,7 @@ class Scene(Fixed):
         self.gravity = None if gravity is None else finite_array("gravity", gravity, (3,))
         self.wind = wind
         self.pins = indices("pins", pins, cloth.nodes, "node")
-        self.pin_stiffness = None if pin_stiffness is None else number("pin_stiffness", pin_stiffness, above=0.0)
+        self.pin_stiffness = None if pin_stiffness is None else real("pin_stiffness", pin_stiffness, above=0.0)
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, whole
+from ..errors import InputError, integer
 
 
 class Weave:
@@ -70,7 +70,7 @@ class Weave:
 
 
 def _grid(rows: int, columns: int) -> np.ndarray:
-    return np.indices((whole("rows", rows, least=3), whole("columns", columns, least=3)))
+    return np.indices((integer("rows", rows, least=3), integer("columns", columns, least=3)))
 
 
 WEAVES = {"plain": Weave.plain, "twill": Weave.twill, "satin": Weave.satin}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..description.scene import Scene
-from ..errors import InputError, SimulationError, number, whole
+from ..errors import InputError, SimulationError, integer, real
 from ..kernels import TERMS
 from .simulator import Simulator
 from .state import State
@@ -121,8 +121,8 @@ def ablate(
         InputError: an argument that cannot be used, or a cloth that does not move.
         SimulationError: the whole scene cannot be simulated. Another one that cannot is a Change with a failure.
     """
-    steps, repeats = whole("steps", steps, least=1), whole("repeats", repeats, least=1)
-    step = number("step", step, above=0.0)
+    steps, repeats = integer("steps", steps, least=1), integer("repeats", repeats, least=1)
+    step = real("step", step, above=0.0)
 
     def run(scene: Scene, fine: int = 1) -> _Run:
         return _Run(scene, fine * steps, step / fine, start, options)

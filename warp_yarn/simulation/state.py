@@ -12,8 +12,8 @@ import numpy as np
 from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
-from ..errors import InputError, finite_array, number, whole
-from ..io.files import whole_file
+from ..errors import InputError, finite_array, integer, real
+from ..io.files import atomic_write
 
 FORMAT = 2
 """Of recordings: 1 had no number, no scene and no count of steps."""
@@ -148,7 +148,7 @@ class Trajectory:
         yarns = np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns])
         colors = np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns])
         numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
-        with whole_file(path) as temporary, open(temporary, "wb") as file:
+        with atomic_write(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
                 format=FORMAT,
@@ -171,7 +171,7 @@ class Trajectory:
         """Reads what ``save`` wrote; an InputError says what is wrong with the file."""
         try:
             with np.load(path) as data:
-                written = whole("format", data["format"].item(), least=1) if "format" in data else 1
+                written = integer("format", data["format"].item(), least=1) if "format" in data else 1
                 if written > FORMAT:
                     raise InputError(f"format = {written}, this warp_yarn reads up to {FORMAT}: it needs a newer one")
                 yarns = [
@@ -194,10 +194,10 @@ class Trajectory:
                 }
                 return cls(
                     cloth,
-                    number("step", data["step"].item(), above=0.0),
+                    real("step", data["step"].item(), above=0.0),
                     **values,
                     scene=_unpacked(cloth, data) if "scene_terms" in data else None,
-                    start=whole("start", data["start"].item(), least=0) if "start" in data else 0,
+                    start=integer("start", data["start"].item(), least=0) if "start" in data else 0,
                 )
         except FileNotFoundError as error:
             raise InputError(f"{Path(path)}: there is no such file") from error
