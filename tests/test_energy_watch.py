@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import warp_yarn.torch as wt
+from internals import force_a_gain
 from warp_yarn.kernels.stepping.energy_watch import EVERY
 
 import warp_yarn as wy
@@ -140,23 +141,6 @@ def test_a_step_that_gains_is_made_by_the_fallback():
     np.testing.assert_allclose(simulator.run(1).position[-1], damped.position[-1], rtol=0.0, atol=1e-10)
 
 
-def force_a_gain(simulator: wy.Simulator) -> list[int]:
-    """Says once of a whole step, in Python, that it gained energy."""
-    from warp_yarn.kernels.core.status import GAINED
-
-    advance, said = simulator._advance, []
-
-    def gained(steps: int) -> int:
-        if said:
-            return advance(steps)
-        said.append(1)
-        simulator.arrays["status"].assign(np.array([GAINED, -1, 1], dtype=np.int32))
-        return 0
-
-    simulator._advance = gained
-    return said
-
-
 # -- no false alarm ----------------------------------------------------------------------------------------------------
 
 
@@ -205,9 +189,8 @@ SCENES = (still, falling, hung, windy, gusty, carried)
 
 def watched(fabric: str, acts, method: str, sliding: bool, *, watches: bool, step: float = 1e-3) -> wy.Simulator:
     cloth = FABRICS[fabric](rows=5, columns=5, pose="flat")
-    simulator = wy.Simulator(wy.Scene(cloth, sliding=sliding, **acts(cloth)), integrator=method, step=step)
-    simulator.model.watches &= watches
-    return simulator
+    scene = wy.Scene(cloth, sliding=sliding, **acts(cloth))
+    return wy.Simulator(scene, integrator=method, step=step, energy_watch=watches)
 
 
 @pytest.mark.parametrize("sliding", [False, True])
@@ -254,7 +237,7 @@ def test_a_first_step_that_is_made_in_parts_raises_no_alarm():
     scene = wy.Scene(cloth, pins=cloth.corners("top"))
     simulator = wy.Simulator(scene, step=4e-3, step_error=1e-5)
     energy = energies(simulator, simulator.run(3))
-    assert simulator.parts.rejected > 0
+    assert simulator.substepping.rejected > 0
     assert energy.max() <= energy[0] + 1e-3 * np.abs(energy).max()
 
 

@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import warp as wp
+from hard_states import STATES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_hard_states import STATES
-from test_integrators import fails_at_first
+from internals import fails_at_first, locks_taken, numbers, put
 
 import warp_yarn as wy
-from warp_yarn.device import exclusive
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.simulation.state import FIELDS
 
@@ -58,19 +57,7 @@ def same(a: wy.State | wy.Trajectory, b: wy.State | wy.Trajectory) -> bool:
 def _locks() -> Iterator[None]:
     """No lock is left taken, which the thread that did so would be the last to find out."""
     yield
-    taken = []
-
-    def take() -> None:
-        for lock in (exclusive.ALONE, exclusive._registering, *exclusive._replaying):
-            if lock.acquire(timeout=2.0):
-                lock.release()
-            else:
-                taken.append(lock)
-
-    thread = threading.Thread(target=take)
-    thread.start()
-    thread.join()
-    assert not taken
+    assert not locks_taken()
 
 
 class _Stop(BaseException):
@@ -185,8 +172,8 @@ def test_damped_steps_are_interrupted_anywhere():
     with interrupted_at(0) as first:
         whole = sim.run(3)
     damped, split = set(sim.damped_steps), dict(sim.split_steps)
-    counts = (sim.parts.made, sim.parts.rejected, sim.parts.damped)
-    assert damped and sim.parts.damped
+    counts = sim.substepping.counts
+    assert damped and sim.substepping.damped
     with interrupted_at(0) as later:
         assert same(started(sim).run(3), whole)
     used = sim
@@ -198,14 +185,14 @@ def test_damped_steps_are_interrupted_anywhere():
             sim.run(3)
         done = sim.steps_done  # settles what is half done
         assert all(k <= done for k in (*sim.damped_steps, *sim.split_steps))
-        assert sim.arrays["damps"].numpy()[0] == 0
+        assert numbers(sim, "damps")[0] == 0
         check_goes_on(sim, whole)
         assert (sim.damped_steps, sim.split_steps) == (damped, split)
-        assert (sim.parts.made, sim.parts.rejected, sim.parts.damped) == counts
+        assert sim.substepping.counts == counts
     other = pickle.loads(pickle.dumps(sim))
     assert (other.damped_steps, other.split_steps) == (damped, split)
     sim.reset()
-    assert sim.damped_steps == set() and sim.parts.damped == 0
+    assert sim.damped_steps == set() and sim.substepping.damped == 0
 
 
 def test_a_team_is_interrupted_anywhere():
@@ -359,7 +346,7 @@ def test_another_state_begins_its_steps_in_parts_anew():
 def test_copies_go_on_as_the_simulator_does(how, name):
     sim = simulator(**OPTIONS[name])
     sim.run(2)
-    sim.arrays["wind_drag"].fill_(3.0)
+    put(sim, "wind_drag", 3.0)
     other = pickle.loads(pickle.dumps(sim)) if how == "pickle" else copy.deepcopy(sim)
     assert same(other.run(3), sim.run(3)) and other.steps_done == sim.steps_done
 
@@ -392,7 +379,8 @@ class Pair:
         """The fresh one, where the other is."""
         fresh, asked = self.fresh, self.asked
         fresh.reset()
-        fresh.state, fresh.steps_done, fresh.parts.size = asked.state, asked.steps_done, asked.parts.size
+        fresh.state, fresh.steps_done = asked.state, asked.steps_done
+        fresh.substepping.next_size = asked.substepping.next_size
         return fresh
 
     def state(self, k: int | None) -> wy.State | None:

@@ -10,6 +10,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingCore
+from internals import pyvista, resampled
 from waving import BLUE, RED, waving
 
 import warp_yarn as wy
@@ -23,7 +24,7 @@ SIZE = (160, 120)
 @pytest.fixture(scope="module")
 def drawing():
     try:
-        render._pyvista()
+        pyvista()
     except wy.InputError as error:
         pytest.skip(str(error))
 
@@ -160,14 +161,14 @@ def test_a_movie_is_from_the_first_to_the_last_frame(movie):
 def test_pictures_of_a_movie_are_along_straight_lines_between_frames():
     position = np.array([[[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], [[1.0, 4.0, 0.0]]])
     expected = [[0, 0, 0], [0.75, 0, 0], [1, 2, 0]]
-    np.testing.assert_allclose(render._resampled(position, 0.75)[:, 0], expected, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(resampled(position, 0.75)[:, 0], expected, rtol=0, atol=1e-15)
     # Neither the last frame is lost to rounding, nor is one past it made up.
     long = np.arange(501.0)[:, None, None]
     for rate, slowdown, count in ((24, 10, 121), (30, 1, 16), (30, 20, 301), (25, 7, 88)):
-        pictures = render._resampled(long, 1.0 / (rate * slowdown) / 1e-3)
+        pictures = resampled(long, 1.0 / (rate * slowdown) / 1e-3)
         assert len(pictures) == count
         np.testing.assert_allclose(pictures[:, 0, 0], np.arange(count) * 1e3 / (rate * slowdown), rtol=1e-12)
-    assert len(render._resampled(position[:1], 0.3)) == 1
+    assert len(resampled(position[:1], 0.3)) == 1
 
 
 def test_progress_bar_on_request_only(drawing, tmp_path, capsys):

@@ -17,7 +17,7 @@ import pytest
 import torch
 import warp as wp
 import warp_yarn.torch as wt
-from test_gradients import WIND, cloth, gradcheck, jittered, scene_for
+from inputs import WIND, cloth, gradcheck, jittered, scene_for
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from internals import a_step_at_a_time, put
 from pxr import Usd, UsdGeom
 from scripts import ROOT, exit_code, load, samples
 
@@ -171,12 +172,12 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
 
 
 def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, capsys):
-    monkeypatch.setattr("warp_yarn.simulation.simulator.CHUNK_BYTES", 0)  # a step at a time
+    a_step_at_a_time(monkeypatch)
     run = wy.Simulator.run_chunk
 
     def storm(simulator, steps):
         if simulator.steps_done == 3:
-            simulator.arrays["wind_velocity"].fill_(np.inf)
+            put(simulator, "wind_velocity", np.inf)
         return run(simulator, steps)
 
     monkeypatch.setattr(wy.Simulator, "run_chunk", storm)
@@ -196,7 +197,7 @@ def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, caps
 
 
 def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
-    monkeypatch.setattr("warp_yarn.simulation.simulator.CHUNK_BYTES", 0)  # a step at a time
+    a_step_at_a_time(monkeypatch)
     run, calls = wy.Simulator.run_chunk, []
 
     def interrupted(simulator, steps):
