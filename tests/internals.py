@@ -135,3 +135,4 @@ halved: Callable = ablation._halved
 unneeded: Callable = ablation._unneeded
 resampled: Callable = render._resampled
 pyvista: Callable = render._pyvista
+Camera, Picture = render._Camera, render._Picture

@@ -26,9 +26,11 @@ import tqdm
 
 from ..description.scene import Scene
 from ..device.arrays import STATE_TYPES
-from ..errors import GradientError, InputError, SimulationError, finite_array, number, whole
+from ..errors import GradientError, InputError, SimulationError, finite_array
+from ..errors import integer as whole
+from ..errors import real as number
 from ..gradients.rollout import Rollout
-from ..io.files import whole_file
+from ..io.files import atomic_write as whole_file
 from ..simulation.simulator import Simulator
 from ..simulation.state import CLOTH_NUMBERS, FIELDS, Trajectory
 

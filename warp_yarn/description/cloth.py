@@ -176,7 +176,7 @@ class Cloth(Fixed):
         return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"
 
     def same_as(self, other: Cloth) -> bool:
-        """Whether another one is made of the same, whatever their weaves are called."""
+        """Tells whether another one is made of the same, whatever their weaves are called."""
         return (
             np.array_equal(self.weave.flipped, other.weave.flipped)
             and [dataclasses.replace(yarn, color=None) for yarn in self.yarns]
@@ -210,7 +210,7 @@ class Cloth(Fixed):
         return np.stack([column, row], axis=1) * self.spacing
 
     def node(self, row: int, column: int) -> int:
-        """Index of a node; negative rows and columns count from the end."""
+        """Gives the index of a node; negative rows and columns count from the end."""
         rows, columns = self.weave.rows, self.weave.columns
         if not (isinstance(row, int | np.integer) and isinstance(column, int | np.integer)):
             raise InputError(f"node (row {row!r}, column {column!r}), must be two whole numbers")
@@ -219,7 +219,7 @@ class Cloth(Fixed):
         return int(column % columns + (row % rows) * columns)
 
     def corners(self, which: str = "all") -> list[int]:
-        """Nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
+        """Lists the nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
         choice("which", which, ("top", "bottom", "all"))
         top = [self.node(0, 0), self.node(0, -1)]
         bottom = [self.node(-1, 0), self.node(-1, -1)]

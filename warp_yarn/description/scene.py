@@ -114,7 +114,7 @@ class Scene(Fixed):
         return result
 
     def same_as(self, other: Scene) -> bool:
-        """Whether another one asks for the same motion."""
+        """Tells whether another one asks for the same motion."""
 
         def values(scene: Scene) -> list[np.ndarray]:
             missing = np.zeros(0)
@@ -130,7 +130,7 @@ class Scene(Fixed):
 
     @staticmethod
     def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
-        """{node: 3 numbers, or steps × 3}."""
+        """Gives {node: 3 numbers, or steps × 3}."""
         if forces is None:
             return {}
         if not isinstance(forces, Mapping):
@@ -148,7 +148,7 @@ class Scene(Fixed):
 
     @staticmethod
     def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
-        """[steps + 1, nodes with a force, 3]; the last row is what stays."""
+        """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
         steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
         path = np.zeros((steps + 1, len(forces), 3))
         for k, value in enumerate(forces.values()):

@@ -48,19 +48,19 @@ class Weave:
 
     @classmethod
     def plain(cls, *, rows: int, columns: int) -> Weave:
-        """Over one, under one."""
+        """Goes over one, under one."""
         j, i = _grid(rows, columns)
         return cls((i + j) % 2 == 1, "plain")
 
     @classmethod
     def twill(cls, *, rows: int, columns: int) -> Weave:
-        """Over two, under two, shifted by one from row to row."""
+        """Goes over two, under two, shifted by one from row to row."""
         j, i = _grid(rows, columns)
         return cls((i + j % 4) % 4 < 2, "twill")
 
     @classmethod
     def satin(cls, *, rows: int, columns: int) -> Weave:
-        """Under one, over three, the single crossings scattered."""
+        """Goes under one, over three, the single crossings scattered."""
         j, i = _grid(rows, columns)
         r = (j - 1) % 4
         return cls((i - 1 + 3 * (r // 2) + 2 * (r % 2)) % 4 == 0, "satin")

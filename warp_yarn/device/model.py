@@ -18,7 +18,9 @@ import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
-from ..errors import InputError, choice, number, whole
+from ..errors import InputError, choice
+from ..errors import integer as whole
+from ..errors import real as number
 from ..kernels import Term, Variant, build
 from ..kernels.stepping.energy_watch import BLOW_UP, GAIN, STILL
 from . import exclusive

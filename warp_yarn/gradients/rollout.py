@@ -16,7 +16,9 @@ import warp as wp
 from ..description.scene import Scene
 from ..device.arrays import STATE_TYPES, YARN_PARAMETERS
 from ..device.exclusive import ALONE, refuse_recording
-from ..errors import GradientError, InputError, choice, number, whole
+from ..errors import GradientError, InputError, choice
+from ..errors import integer as whole
+from ..errors import real as number
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 from .adjoint import Adjoint

@@ -120,8 +120,8 @@ def _write_stage(
 
 
 def origins(trajectory: Trajectory) -> np.ndarray:
-    """Where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would move
-    them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
+    """Finds where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would
+    move them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
     position = trajectory.position
     low, high = position.min(axis=1), position.max(axis=1)
     reach = COARSE * trajectory.cloth.radius / np.finfo(np.float32).epsneg
@@ -160,7 +160,7 @@ def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndar
 
 
 def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
-    """displayColor is linear; the colours of yarns are those of a screen (sRGB)."""
+    """Writes a yarn's colour, which is that of a screen (sRGB), as displayColor, which is linear."""
     from pxr import Gf, UsdGeom
 
     color = np.array(part.color, dtype=np.float64)

@@ -84,7 +84,7 @@ class Ablation:
     together: Change | None
 
     def lines(self) -> list[str]:
-        """What was found, in words."""
+        """Says what was found, in words."""
         found = [str(change) for change in self.changes]
         found.append(f"half the step moves the cloth by {percent(self.step_error)}")
         if not self.unneeded:
@@ -99,7 +99,7 @@ class Ablation:
 
 
 def percent(fraction: float) -> str:
-    """In percent, with two digits."""
+    """Writes a fraction in percent, with two digits."""
     return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
@@ -166,7 +166,7 @@ class _Run:
         self.seconds: list[float] = []
 
     def make(self) -> float:
-        """One run from the beginning; its wall time [s]."""
+        """Makes one run from the beginning, and gives its wall time [s]."""
         self.simulator.state, self.simulator.steps_done = self.start, 0
         begin = time.perf_counter()
         self.position = self.simulator.run(self.steps).position
@@ -177,7 +177,7 @@ class _Run:
 
 
 def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> list[Change]:
-    """The runs beside that of the whole scene, timed in turn with it."""
+    """Compares runs with that of the whole scene, timed in turn with it."""
     failures = {}
     for name, run in runs.items():
         try:
@@ -204,14 +204,14 @@ def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> 
 
 
 def _without(scene: Scene, names: set[str]) -> Scene:
-    """The scene without these terms, or sliding."""
+    """Makes the scene without these terms, or sliding."""
     sliding = scene.sliding and "sliding" not in names
     left = (name for name in scene.terms if name not in names)
     return scene.replace(sliding=sliding, terms=[name for name in left if sliding or not TERMS[name].sliding_only])
 
 
 def _halved(scene: Scene, start: State | None) -> Scene:
-    """The scene for half the step: pins go evenly to where they are at a step's end, and forces stay for two."""
+    """Makes the scene for half the step: pins go evenly to where they are at a step's end, and forces stay for two."""
     path = scene.pin_path
     if path is not None:
         first = (scene.cloth if start is None else start).position[scene.pins]

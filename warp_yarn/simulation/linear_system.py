@@ -29,7 +29,7 @@ class LinearSystem:
 
 
 def read_system(model: Model) -> LinearSystem:
-    """Reads the system that a model has assembled; ``kernels/linear/block_matrix.py`` tells the layout of its blocks."""
+    """Reads the system that a model has assembled; ``kernels/linear/block_matrix.py`` tells how its blocks lie."""
     a, nodes, stencil = model.arrays, model.scene.cloth.nodes, model.arrays.stencil
     values = {name: a[name].numpy() for name in (*MATRIX, "rhs", "euler_rhs") if a[name] is not None}
     x = np.arange(3 * nodes).reshape(nodes, 3)

@@ -134,8 +134,9 @@ class Simulator(Inspection):
         with ALONE, compiling():
             self.stepper = _made(scene, **self._options)
             self.scene, self.model, self.integrator = scene, self.stepper.model, self.stepper.integrator
-            self.arrays, self.step_size, self.chunk = self.model.arrays, self.model.step_size, self.stepper.frames.chunk
-            self.substepping = self.stepper.substepping
+            self.arrays, self.substepping = self.model.arrays, self.stepper.substepping
+            self.step_size = self.model.step_size
+            self.chunk = self.stepper.frames.chunk
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
         warn_of_threads(threads)

@@ -38,7 +38,7 @@ class State:
     anchor: np.ndarray | None = None
 
     def __eq__(self, other: object) -> bool:
-        """Whether two are the same, to the last bit."""
+        """Tells whether two are the same, to the last bit."""
         if not isinstance(other, State):
             return NotImplemented
         pairs = [(getattr(self, name), getattr(other, name)) for name in FIELDS[:-1]]
@@ -46,7 +46,8 @@ class State:
         return all(np.array_equal(a, b) for a, b in [*pairs, tuple(anchors)])
 
     def checked(self, nodes: int) -> State:
-        """A copy with every array finite and of the right shape, and Δs > 0 left to the simulator; or an InputError."""
+        """Copies it, with every array finite and of the right shape; an InputError says what is not. Δs > 0 is left to
+        the simulator."""
         euler = finite_array("state.euler", self.euler, (nodes, 2))
         return State(
             finite_array("state.position", self.position, (nodes, 3)),
@@ -89,7 +90,7 @@ class Trajectory:
         return self.start + len(self) - 1
 
     def __eq__(self, other: object) -> bool:
-        """Whether two have the same frames of the same cloth, to the last bit."""
+        """Tells whether two have the same frames of the same cloth, to the last bit."""
         if not isinstance(other, Trajectory):
             return NotImplemented
         if not self.cloth.same_as(other.cloth) or (self.step, self.start) != (other.step, other.start):
@@ -100,7 +101,7 @@ class Trajectory:
         return len(self.position)
 
     def __getitem__(self, frame: int) -> State:
-        """One frame, as a State; negative frames count from the end."""
+        """Copies one frame, as a State; negative frames count from the end."""
         return State(*(getattr(self, name)[frame].copy() for name in FIELDS))
 
     @property
@@ -109,12 +110,12 @@ class Trajectory:
         return np.arange(len(self)) * self.step
 
     def cut(self, frames: int) -> Trajectory:
-        """The first frames of it."""
+        """Takes the first frames of it."""
         parts: dict[str, Any] = {name: getattr(self, name)[:frames] for name in FIELDS}
         return dataclasses.replace(self, **parts)
 
     def joined(self, later: Trajectory) -> Trajectory:
-        """This and a run that went on from its last frame.
+        """Joins this and a run that went on from its last frame.
 
         Raises:
             InputError: it did not: its cloth, scene, step, steps before it or first frame (beyond what single precision
@@ -208,7 +209,7 @@ class Trajectory:
 
 
 def _packed(scene: Scene) -> dict[str, Any]:
-    """A scene as arrays; what is None is left out."""
+    """Packs a scene into arrays; what is None is left out."""
     wind = scene.wind
     values = {
         "terms": np.array(scene.terms),
@@ -226,7 +227,7 @@ def _packed(scene: Scene) -> dict[str, Any]:
 
 
 def _unpacked(cloth: Cloth, data: Any) -> Scene:
-    """The scene that ``_packed`` made arrays of."""
+    """Makes the scene that ``_packed`` made arrays of."""
 
     def value(name: str) -> Any:
         return data.get(f"scene_{name}")

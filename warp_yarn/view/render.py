@@ -166,7 +166,7 @@ class _Picture:
         self.plotter.close()
 
     def drawn(self, frame: int, path: Path | None = None) -> np.ndarray:
-        """One frame as an image [height, width, 3], written to path if one is given."""
+        """Draws one frame as an image [height, width, 3], written to path if one is given."""
         for mesh, tubes in zip(self.meshes, self.tubes, strict=True):
             mesh.points = tubes.vertices(frame)
             mesh.point_data.active_normals = tubes.normals(frame)
@@ -202,12 +202,12 @@ class _Camera:
         return cls(axes, centre, distance, (max(distance - reach, 0.01 * distance), distance + reach))
 
     def world(self, place: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
-        """A place seen from the centre along the axes, in the cloth's coordinates."""
+        """Finds a place seen from the centre along the axes, in the cloth's coordinates."""
         return (self.centre + np.asarray(place)) @ self.axes
 
 
 def _resampled(position: np.ndarray, apart: float) -> np.ndarray:
-    """Positions at frames 0, apart, 2 apart, ... up to the last, in between them along straight lines."""
+    """Interpolates positions at frames 0, apart, 2 apart, ... up to the last, in between them along straight lines."""
     last = len(position) - 1
     # Where a picture falls on the last frame, rounding must not lose it.
     at = np.arange(np.floor(last / apart + 1e-9) + 1.0) * apart
@@ -241,7 +241,7 @@ _LOADING = threading.Lock()
 
 
 def _pyvista() -> Any:
-    """PyVista, where VTK can draw; where it cannot, VTK would end the process by a segmentation fault."""
+    """Imports PyVista, where VTK can draw; where it cannot, VTK would end the process by a segmentation fault."""
     with _LOADING:
         pv = _loaded_pyvista()
         # it imports what draws when that is first asked for
