@@ -6,7 +6,7 @@ import threads
 import torch
 import warp as wp
 
-pytest.register_assert_rewrite("cases", "checks", "internals", "inputs", "scripts")
+pytest.register_assert_rewrite("cases", "checks", "internals", "inputs")
 
 FEW = ("rest", "random", "folded")
 """States whose faults the others hardly add to."""

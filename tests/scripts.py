@@ -39,6 +39,8 @@ class Later:
         object.__setattr__(self, "_found", functools.cache(find))
 
     def __getattr__(self, name: str) -> Any:
+        if name in ("__test__", "_mock_name"):  # pytest asks all that it finds for these
+            raise AttributeError(name)
         return getattr(self._found(), name)
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import warp as wp
+from cases import quick
 from hard_states import STATES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -120,7 +121,7 @@ def test_a_run_is_interrupted_anywhere(name):
     assert stopped > 100
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", quick(INTEGRATORS, "linear", "sdirk2"))
 def test_the_first_step_is_interrupted_anywhere(integrator):
     """While its graph is captured: no capture stays open."""
     whole = simulator(integrator=integrator).run(2)
@@ -156,6 +157,7 @@ def test_steps_in_parts_are_interrupted_anywhere():
         assert sim.split_steps == split
 
 
+@pytest.mark.slow
 def test_damped_steps_are_interrupted_anywhere():
     """Steps that gain energy, which another method makes: in new simulators, where it is made too, and in one."""
     hard = STATES["swapped"]()

@@ -278,6 +278,7 @@ def test_shear_is_learned_from_the_middle_of_a_motion_with_paths():
     assert result.task is problem and result.step_share < 1e-3
 
 
+@pytest.mark.slow
 def test_tasks_and_results_go_to_another_process_and_back(data):
     problem = task(data)
     for made in (copy.deepcopy(problem), pickle.loads(pickle.dumps(problem))):
@@ -598,6 +599,7 @@ def test_a_step_that_cannot_be_halved_leaves_its_part_unknown(data, monkeypatch)
     ("fabric", "pose", "of", "seeds"),
     [("paper", "saddle", ("same", "finer"), 3), ("handkerchief", "flat", ("same",), 2)],
 )
+@pytest.mark.slow
 def test_uncertainties_hold_where_yarns_ring_and_where_they_hardly_tell(fabric, pose, of, seeds):
     """Before: 170 standard deviations off with the ringing saddle's finer data, 40 with the handkerchief."""
     for truth in of:

@@ -112,6 +112,7 @@ def test_a_recording_without_a_scene_is_not_resumed(usd, tmp_path, capsys):
     assert "has no scene to go on with" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_with_code_2_and_keeps_the_frames(usd, tmp_path, capsys, monkeypatch):
     resource = pytest.importorskip("resource")
     (tmp_path / "temporary").mkdir()
@@ -149,7 +150,7 @@ def test_an_output_folder_that_cannot_be_written_is_found_before_the_run(monkeyp
     assert "/proc/self/hang.usdc: nothing can be written" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("encoding", ["cp932", "ascii"])
+@pytest.mark.parametrize("encoding", [pytest.param("cp932", marks=pytest.mark.slow), "ascii"])
 def test_output_does_not_depend_on_the_terminal(usd, encoding):
     """Nor does what is written."""
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "LC_ALL": "C"}

@@ -7,7 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
-from cases import CLOTHS, make_state, simulator
+from cases import CLOTHS, make_state, quick, simulator
 from internals import numbers, put
 
 import warp_yarn as wy
@@ -25,7 +25,7 @@ def cloth(rows: int, columns: int, **options) -> wy.Cloth:
 @pytest.mark.parametrize("preconditioner", ["incomplete", "jacobi"])
 @pytest.mark.parametrize("sliding", [True, False], ids=["sliding", "locked"])
 @pytest.mark.parametrize("held", [True, False], ids=["exact pins", "springs"])
-@pytest.mark.parametrize("name", CLOTHS)
+@pytest.mark.parametrize("name", quick(CLOTHS, "plain"))
 def test_step_is_a_dense_solve(name: str, held: bool, sliding: bool, preconditioner: str) -> None:
     c = simulator(name, None).scene.cloth
     pins = c.corners("top")
