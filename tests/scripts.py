@@ -39,7 +39,8 @@ class Later:
         object.__setattr__(self, "_found", functools.cache(find))
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("__test__", "_mock_name"):  # pytest asks all that it finds for these
+        # pytest asks all that it finds for such names
+        if name.startswith("_") and name not in ("__dict__", "__name__"):
             raise AttributeError(name)
         return getattr(self._found(), name)
 
