@@ -20,8 +20,8 @@ KEPT = ("mass", "pins", "applied")
 DEARER = -0.1
 """Costs below this are worth a word: the solver needs the term more than the cloth does."""
 
-SLOW = 5.0
-"""Runs that take so many times as long are timed once."""
+TIMED_ONCE = 5.0
+"""Times as long as the whole scene's: runs from there on are timed once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +191,7 @@ def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> 
         full.seconds.append(whole_time)
         for name, run in made.items():
             # what takes that much longer needs no second look
-            if not ratios[name] or ratios[name][0] < SLOW:
+            if not ratios[name] or ratios[name][0] < TIMED_ONCE:
                 ratios[name].append(run.make() / whole_time)
     changes = []
     for name, run in runs.items():

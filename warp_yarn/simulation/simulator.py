@@ -144,7 +144,7 @@ class Simulator(Inspection):
     parts = renamed_attribute("parts", "substepping")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies and pickles are simulators of the same scene and options, with the state and parameters of this."""
+        """Makes copies and pickles simulators of the same scene and options, with the state and parameters of this."""
         with self.lock:
             values = {name: self.arrays[name].numpy().copy() for name in PARAMETERS if name in self.arrays}
             steps = (self.steps_done, dict(self.split_steps), set(self.damped_steps))
