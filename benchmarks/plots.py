@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from warp_yarn.io.files import whole_file
+from warp_yarn.io.files import atomic_write
 
 PICTURES = Path(__file__).parents[1] / "docs"
 
@@ -19,5 +19,5 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "*")
 def save(figure: Figure, path: Path) -> None:
     """Writes a figure as a PNG file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=130)

@@ -38,7 +38,7 @@ from plots import PICTURES
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.io.files import whole_file
+from warp_yarn.io.files import atomic_write
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
 
@@ -233,7 +233,7 @@ def draw(path: Path, rows: list[dict[str, Any]], maps: tuple[Case, ...], others:
     unknown = Line2D([], [], color="k", marker="$?$", linestyle="", label="nothing to compare with")
     left_out = Patch(facecolor="white", edgecolor="0.7", label="too large or too stiff to run")
     figure.legend(handles=[*legend, line, unknown, left_out], loc="outside lower center", ncols=6, frameon=False)
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
 
 

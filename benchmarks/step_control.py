@@ -36,11 +36,11 @@ FIRST_PART = 1e-3
 
 def made(simulator: wy.Simulator, count: int) -> Callable[[], np.ndarray]:
     """A function that makes all of a motion from its beginning, and returns where it ends."""
-    start, parts = simulator.state, simulator.parts
+    start, parts = simulator.state, simulator.substepping
 
     def run() -> np.ndarray:
         simulator.state, simulator.steps_done = start, 0
-        parts.size, parts.made, parts.rejected = FIRST_PART / simulator.step_size, 0, 0
+        parts.next_size, parts.accepted, parts.rejected = FIRST_PART / simulator.step_size, 0, 0
         return end(simulator, count)
 
     return run
@@ -57,8 +57,8 @@ def rows(motion: Motion, name: str, size: int, repeats: int) -> list[dict[str, A
     for (simulator, count), make in zip(runs, makes, strict=True):
         row = {"motion": name, **motion.about(size), "step error": simulator.step_error or "even"}
         row["error"] = converged.error(make())
-        parts = simulator.parts
-        row |= {"steps": count, "rejected": 0} if count > 1 else {"steps": parts.made, "rejected": parts.rejected}
+        parts = simulator.substepping
+        row |= {"steps": count, "rejected": 0} if count > 1 else {"steps": parts.accepted, "rejected": parts.rejected}
         result.append(row)
 
     def timed(make: Callable[[], np.ndarray]) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 import warp_yarn as wy
-from warp_yarn.errors import number, whole
+from warp_yarn.errors import integer, real
 from warp_yarn.io.files import check_writable
 
 
@@ -40,7 +40,7 @@ class Run:
 
 def simulate(simulator: wy.Simulator, steps: int) -> Run:
     """Makes steps under a progress bar: Ctrl-C or a step that fails leaves every frame before it."""
-    steps, begin, stop = whole("steps", steps, least=1), time.perf_counter(), None
+    steps, begin, stop = integer("steps", steps, least=1), time.perf_counter(), None
     try:
         trajectory = simulator.run(steps, progress=None)
     except (wy.SimulationError, KeyboardInterrupt) as error:
@@ -71,13 +71,13 @@ def read_number(name: str, text: str, **allowed: float) -> float:
     """A number that was typed.
 
     Raises:
-        InputError: it is none, or out of its range (as of ``errors.number``).
+        InputError: it is none, or out of its range (as of ``errors.real``).
     """
     try:
         value: Any = float(text)
     except ValueError:
-        value = text  # and number() says so
-    return number(name, value, **allowed)
+        value = text  # and real() says so
+    return real(name, value, **allowed)
 
 
 def file_ending(*endings: str) -> Callable[[str], Path]:

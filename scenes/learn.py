@@ -33,9 +33,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 
 import warp_yarn as wy
 from warp_yarn.calibration.learn import PAPER, CalibrationProblem, Parameter, Result, learn, learnable, split, value_of
-from warp_yarn.errors import whole
+from warp_yarn.errors import integer
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.io.files import whole_file
+from warp_yarn.io.files import atomic_write
 from warp_yarn.io.usd import ENDINGS, reload, writing
 from warp_yarn.presets import paper
 from warp_yarn.simulation.state import FIELDS
@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         raise
     task = result.problem  # its step may be shorter now
     numbers = summary(task, result, options.file)
-    with whole_file(options.result) as temporary:
+    with atomic_write(options.result) as temporary:
         temporary.write_text(json.dumps(numbers, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     plot(options.plot, task, result)
     tell(task, result)
@@ -146,7 +146,7 @@ def read(options: argparse.Namespace) -> tuple[wy.Scene, wy.Trajectory]:
             scene = paper.hung(target.cloth, wind=wy.Wind(velocity=tuple(options.wind or paper.WIND)))
     if options.first is None:
         options.first = first
-    if options.frames is None and len(target) - 1 - options.first > FRAMES * whole("every", options.every, least=1):
+    if options.frames is None and len(target) - 1 - options.first > FRAMES * integer("every", options.every, least=1):
         options.frames = FRAMES
     return scene, target
 
@@ -248,7 +248,7 @@ def plot(path: Path, task: CalibrationProblem, result: Result) -> None:
         axes.set_xlabel("iteration")
     handles, labels = grid[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=150)
 
 
@@ -278,7 +278,7 @@ def thinned(trajectory: wy.Trajectory, first: int, every: int, step: float) -> w
 
 def side_by_side(path: Path, trajectories: dict[str, wy.Trajectory], slowdown: float) -> None:
     """Trajectories as one USD file: /comparison, and below it a name each, next to each other along x."""
-    with tempfile.TemporaryDirectory() as folder, whole_file(path) as temporary, writing(path):
+    with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary, writing(path):
         # as write_usd: no stage may hold the file when it is moved
         _write_side_by_side(Path(folder), temporary, trajectories, slowdown)
     reload(path)

@@ -24,8 +24,8 @@ from common import command, file_ending, make_folders
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
-from warp_yarn.errors import number, whole
-from warp_yarn.io.files import whole_file
+from warp_yarn.errors import integer, real
+from warp_yarn.io.files import atomic_write
 from warp_yarn.presets import paper
 
 DAMPING = 1e-4
@@ -79,7 +79,7 @@ def pull(
     row = cloth.weave.rows // 2 if row is None else row
     tail, end = cloth.node(row, 0), cloth.node(row, -1)
     pins = [node for node in range(cloth.nodes) if node != tail]
-    steps = whole("distance / (speed · step)", round(distance / (speed * step)), least=1)
+    steps = integer("distance / (speed · step)", round(distance / (speed * step)), least=1)
     path = np.repeat(cloth.position[None, pins], steps, axis=0)
     path[:, pins.index(end), 0] += speed * step * np.arange(1, steps + 1)
     scene = wy.Scene(cloth, gravity=None, pins=pins, pin_path=path, pin_stiffness=None, **options)
@@ -162,8 +162,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Pull]:
     """
     options = parser().parse_args(arguments)
     make_folders([options.png, options.csv])
-    size = whole("--size", options.size, least=4)
-    motion = {name: number(f"--{name}", getattr(options, name), above=0.0) for name in ("speed", "distance", "step")}
+    size = integer("--size", options.size, least=4)
+    motion = {name: real(f"--{name}", getattr(options, name), above=0.0) for name in ("speed", "distance", "step")}
     plain = cloth("plain", size)
     pulls = {
         f"eq. 4, dimensionless, steps of {1e3 * motion['step']:g} ms": pull(plain, **motion),
@@ -206,14 +206,14 @@ def write_chart(
         right.plot(*zip(*points, strict=True), "o-", label=weave)
     right.set(xlabel="yarns a mm", ylabel="largest force (mN)", title="Weaves of one width", ylim=(0.0, None))
     right.legend()
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=130, format="png")
 
 
 def write_numbers(path: Path, pulls: dict[str, Pull], distance: np.ndarray, exact: np.ndarray) -> None:
     rows = [(name, *row) for name, found in pulls.items() for row in zip(found.distance, found.force, strict=True)]
     rows += [("exact Coulomb friction", *row) for row in zip(distance, exact, strict=True)]
-    with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["law", "distance [m]", "force [N]"])
         writer.writerows(rows)

@@ -25,7 +25,7 @@ from pathlib import Path
 from common import command
 
 import warp_yarn as wy
-from warp_yarn.errors import whole
+from warp_yarn.errors import integer
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> Ablation:
     options = parser().parse_args(arguments)
     scene, state = chosen(options)
     method = {} if options.integrator is None else {"integrator": options.integrator}
-    steps, repeats = whole("--steps", options.steps, least=1), whole("--repeats", options.repeats, least=1)
+    steps, repeats = integer("--steps", options.steps, least=1), integer("--repeats", options.repeats, least=1)
     found = ablate(scene, steps=steps, step=options.step, repeats=repeats, start=state, **method)
     weave, cost = scene.cloth.weave, f"{1e3 * found.seconds:.3g} ms each"
     print(f"{weave.rows} × {weave.columns} yarns, {steps} steps of {1e3 * options.step:g} ms, {cost}")

@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
-from warp_yarn.errors import finite_array, number, whole
-from warp_yarn.io.files import whole_file
+from warp_yarn.errors import finite_array, integer, real
+from warp_yarn.io.files import atomic_write
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets.fabrics import FABRICS
 
@@ -66,9 +66,9 @@ class Throw:
         self.cloth, self.forces = cloth, forces
         self.target = finite_array("--target", target, (3,))
         self.distance = float(np.linalg.norm(self.target))
-        number("the distance of --target", self.distance, above=0.0)
-        self.duration = number("--time", duration, above=0.0)
-        self.steps = whole("--steps", steps, least=PUSHED + 1 if forces else 1)
+        real("the distance of --target", self.distance, above=0.0)
+        self.duration = real("--time", duration, above=0.0)
+        self.steps = integer("--steps", steps, least=PUSHED + 1 if forces else 1)
         self.step = self.duration / self.steps
         zero = np.zeros((PUSHED, 3))
         pushed = {node: zero for node in cloth.corners()} if forces else None
@@ -238,9 +238,9 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     options = parser().parse_args(arguments)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
-    whole("--iterations", options.iterations, least=1)
-    number("--rate", options.rate, above=0.0)
-    number("--within", options.within, least=0.0)
+    integer("--iterations", options.iterations, least=1)
+    real("--rate", options.rate, above=0.0)
+    real("--within", options.within, least=0.0)
     make_folders([options.output, options.plot, options.result])
     make = FABRICS[options.fabric]
     cloth = make(weave=options.weave, rows=options.size, columns=options.size, pose="flat")
@@ -288,7 +288,7 @@ def numbers(throw: Throw, found: Search) -> dict[str, Any]:
 
 def write(throw: Throw, found: Search, result: dict[str, Any], options: argparse.Namespace) -> None:
     """The output files, those first that need the least."""
-    with whole_file(options.result) as temporary:
+    with atomic_write(options.result) as temporary:
         temporary.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     trajectory = throw.trajectory(found.best)
     write_all(
@@ -306,7 +306,7 @@ def plot(path: Path, found: Search) -> None:
     axes.set_xlabel("iteration")
     axes.set_ylabel("loss: |centre − target|² / |target|²")
     axes.grid(alpha=0.3)
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=150)
 
 

@@ -6,8 +6,10 @@ import dataclasses
 import functools
 import itertools
 import zlib
+from collections.abc import Iterable
 
 import numpy as np
+import pytest
 from reference import Oracle, Tensor, tensor
 
 import warp_yarn as wy
@@ -205,3 +207,8 @@ def cases(
     names: tuple[str, ...] = CLOTHS, states: tuple[str, ...] = STATES, sliding: tuple[bool, ...] = (True, False)
 ) -> tuple[Case, ...]:
     return tuple(Case(*case) for case in itertools.product(names, states, sliding))
+
+
+def quick(names: Iterable[object], *first: object) -> list[object]:
+    """Parameters of a test of which those that are named here are quick, and the others, one more of a kind, slow."""
+    return [name if name in first else pytest.param(name, marks=pytest.mark.slow) for name in names]

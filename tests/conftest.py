@@ -1,14 +1,17 @@
 """Keeps Warp quiet and torch to one thread, gives the tests of a term their cases, and has the option --shuffled."""
 
 import pytest
+import scripts
 import threads
 import torch
 import warp as wp
 
-pytest.register_assert_rewrite("cases", "checks")
+pytest.register_assert_rewrite("cases", "checks", "internals", "inputs")
 
 FEW = ("rest", "random", "folded")
 """States whose faults the others hardly add to."""
+
+SCRIPTS_AT_COLLECTION = pytest.StashKey[list[str]]()
 
 wp.config.quiet = True
 torch.set_num_threads(1)
@@ -35,3 +38,14 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         few = [case for case in cases if case.cloth_name == "plain" and case.state_name in FEW] or cases
         marked = [case if case in few else pytest.param(case, marks=pytest.mark.slow) for case in cases]
         metafunc.parametrize("case", marked, ids=str)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Writes down what was imported by then that only running tests may import."""
+    session.config.stash[SCRIPTS_AT_COLLECTION] = scripts.loaded()
+
+
+@pytest.fixture
+def scripts_at_collection(pytestconfig: pytest.Config) -> list[str]:
+    """Scripts of scenes/ and benchmarks/ that were imported when the tests had been collected."""
+    return pytestconfig.stash[SCRIPTS_AT_COLLECTION]

@@ -2,13 +2,14 @@
 
 import csv
 import dataclasses
+import functools
 import itertools
-import sys
+from typing import Any
 
 import numpy as np
 import pytest
-import warp as wp
-from scripts import exit_code, load
+from internals import add_array, array_arguments, halved, numbers, unneeded
+from scripts import beside, exit_code, load
 
 import warp_yarn as wy
 from warp_yarn.simulation import ablation
@@ -25,7 +26,7 @@ terms = load("benchmarks/terms.py")
 terms_scene = load("scenes/terms.py")
 defaults = load("benchmarks/defaults.py")
 iterations = load("benchmarks/iterations.py")
-motions = sys.modules["motions"]
+motions = beside(work, "motions")
 
 
 @pytest.fixture(autouse=True)
@@ -106,20 +107,22 @@ def test_the_time_to_an_error_is_where_a_curve_stays_below_it():
     assert work.time_to([], 0.02) is None
 
 
-SHORT = dataclasses.replace(motions.MOTIONS["hung"], duration=5e-3, finest=1e-3 / 128)
-"""The hung cloth for 5 ms: smooth, and every method is soon near."""
+@functools.cache
+def short() -> Any:
+    """The hung cloth for 5 ms: smooth, and every method is soon near."""
+    return dataclasses.replace(motions.MOTIONS["hung"], duration=5e-3, finest=1e-3 / 128)
 
 
 def test_steps_fit_into_the_motions():
     for motion in motions.MOTIONS.values():
         assert all(motion.steps(step) * step == pytest.approx(motion.duration) for step in work.STEPS)
     with pytest.raises(wy.InputError, match="whole times"):
-        SHORT.steps(3e-3)
+        short().steps(3e-3)
 
 
 def test_two_methods_agree_on_the_reference(monkeypatch):
-    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
-    found = references.reference(SHORT, 4)
+    monkeypatch.setitem(motions.MOTIONS, "hung", short())
+    found = references.reference(short(), 4)
     assert found.check in work.INTEGRATORS
     assert found.check != references.REFERENCE
     # seen: 9e-6; the errors below are 1000 times it
@@ -136,7 +139,7 @@ def test_two_methods_agree_on_the_reference(monkeypatch):
 
 def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
     # squares of such velocities are not finite
-    monkeypatch.setitem(motions.MOTIONS, "hung", dataclasses.replace(SHORT, speed=(0.0, 0.0, 1e200)))
+    monkeypatch.setitem(motions.MOTIONS, "hung", dataclasses.replace(short(), speed=(0.0, 0.0, 1e200)))
     curve = work.Curve("hung", "linear", "double", None)
     converged = references.Reference(np.zeros((16, 3)), 1.0, "none", 1e-5)
     failed = work.point(curve, 4, 1e-3, converged, repeats=1)
@@ -154,7 +157,7 @@ def test_a_run_that_fails_is_a_point_with_a_reason(monkeypatch):
 
 @pytest.mark.slow
 def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
+    monkeypatch.setitem(motions.MOTIONS, "hung", short())
     monkeypatch.setattr(work, "STEPS", (1e-3, 5e-4, 2.5e-4))
     output, plot = tmp_path / "wp.csv", tmp_path / "wp.png"
     work.main(["--size", "3", "--motions", "hung", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
@@ -171,13 +174,18 @@ def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
 
 # -- benchmarks/motions.py --------------------------------------------------------------------------------------------
 
+MOTIONS = ("hung", "snap", "pull", "throw", "drop", "strip", "carried")
 EXACT = references.EXACT
 """Tolerances near rounding."""
 norm = np.linalg.norm
 
 
+def test_the_motions_are_these():
+    assert tuple(motions.MOTIONS) == MOTIONS
+
+
 @pytest.mark.parametrize("fabric", [None, *wy.fabrics.FABRICS])
-@pytest.mark.parametrize("name", motions.MOTIONS)
+@pytest.mark.parametrize("name", MOTIONS)
 def test_a_motion_is_made_of_any_fabric(name, fabric):
     motion = motions.find(name, fabric)
     assert motion.fabric == fabric or fabric is None
@@ -240,11 +248,11 @@ def test_a_clamped_strip_bends_down_from_its_clamp():
 
 def test_a_carried_cloth_has_the_path_of_half_the_step():
     motion = motions.find("carried")
-    half = ablation._halved(motion.scene(4, 1e-3), None)
+    half = halved(motion.scene(4, 1e-3), None)
     np.testing.assert_allclose(half.pin_path, motion.scene(4, 5e-4).pin_path, rtol=0, atol=1e-15)
     moved = motion.simulator(4, step=1e-3).state
     moved.position += 1.0
-    assert (ablation._halved(motion.scene(4, 1e-3), moved).pin_path[0] > half.pin_path[0]).all()
+    assert (halved(motion.scene(4, 1e-3), moved).pin_path[0] > half.pin_path[0]).all()
 
 
 # -- benchmarks/equal_error.py ----------------------------------------------------------------------------------------
@@ -307,10 +315,10 @@ def test_parts_are_compared_with_even_steps_of_their_error(monkeypatch):
 
 
 def test_step_control_from_the_command(monkeypatch, tmp_path):
-    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
+    monkeypatch.setitem(motions.MOTIONS, "hung", short())
     monkeypatch.setattr(control, "COUNTS", (5, 20))
     monkeypatch.setattr(control, "STEP_ERRORS", (1e-2,))
-    end = references.end(SHORT.simulator(3, step=1e-4), 50)
+    end = references.end(short().simulator(3, step=1e-4), 50)
     monkeypatch.setattr(control, "reference", lambda motion, size: references.Reference(end, 1e-4, "", 0.0))
     output = tmp_path / "c.csv"
     control.main(["--size", "3", "--motions", "hung", "--fabric", "paper", "--repeats", "1", "--output", str(output)])
@@ -326,9 +334,9 @@ def test_step_control_from_the_command(monkeypatch, tmp_path):
 def test_array_bytes_counts_each_memory_once():
     simulator = wy.Simulator(wy.paper.hung_cloth(rows=5, columns=5))
     counted = sizes.array_bytes(simulator)
-    simulator.arrays["predicted"] = simulator.arrays["position"]
+    add_array(simulator, "predicted", "position")
     assert sizes.array_bytes(simulator) == counted
-    simulator.arrays["predicted"] = simulator.arrays.new("predicted")
+    add_array(simulator, "predicted", None)
     assert sizes.array_bytes(simulator) == counted + 25 * 24
 
 
@@ -376,13 +384,14 @@ def test_a_size_that_fails_is_a_row_with_a_reason(monkeypatch):
 # -- benchmarks/bandwidth.py ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preconditioner", bandwidth.PASSES)
+def test_two_preconditioners_have_passes():
+    assert set(bandwidth.PASSES) == {"incomplete", "jacobi"}
+
+
+@pytest.mark.parametrize("preconditioner", ["incomplete", "jacobi"])
 def test_the_passes_have_every_array_of_the_iteration(preconditioner):
     simulator = wy.Simulator(wy.paper.hung_cloth(rows=3, columns=3), preconditioner=preconditioner)
-    kernel = simulator.model.kernels[f"{preconditioner}_conjugate_gradient"]
-    arrays = {a.label for a in kernel.adj.args if isinstance(a.type, wp.array)}
-    structs = [a.type for a in kernel.adj.args if a.label in ("blocks", "work")]
-    arrays |= {name for struct in structs for name, field in struct.vars.items() if isinstance(field.type, wp.array)}
+    arrays = array_arguments(simulator, f"{preconditioner}_conjugate_gradient")
     # what only the beginning reads, and what the end reports
     once = {"rhs", "euler_rhs", "tolerance", "iterations", "residual", "status"}
     # where several threads meet
@@ -410,8 +419,8 @@ def test_bytes_of_an_iteration_without_sliding():
 def test_a_solve_makes_the_iterations_that_it_is_asked_for():
     solver = bandwidth.Solver(9, True, "incomplete", 1)
     assert solver.solve(bandwidth.LONG) > 0.0
-    assert int(solver.simulator.arrays["iterations"].numpy()[0]) == bandwidth.LONG
-    assert not solver.simulator.arrays["status"].numpy().any()
+    assert int(numbers(solver.simulator, "iterations")[0]) == bandwidth.LONG
+    assert not numbers(solver.simulator, "status").any()
     # past the attainable accuracy it stops, and then there is nothing to divide by
     with pytest.raises(RuntimeError, match="nothing can be told"):
         solver.solve(1000)
@@ -487,17 +496,17 @@ def test_half_the_step_keeps_paths_in_time():
     path = cloth.position[pins] + np.linspace(0.0, 1e-3, 5)[1:, None, None]
     force = np.linspace(1e-4, 3e-4, 3)[:, None] * [[0.0, 1.0, 0.0]]
     scene = wy.Scene(cloth, pins=pins, pin_path=path, forces={cloth.node(3, 1): force})
-    half = ablation._halved(scene, None)
+    half = halved(scene, None)
     whole, fine = wy.Simulator(scene, step=1e-5), wy.Simulator(half, step=5e-6)
     # a force that holds a step of the whole holds two of the half; pins are half-way in the first of them
     before = cloth.position[pins]
     for k in range(6):
         whole.run(1)
-        target, force = whole.arrays["pin_target"].numpy().copy(), whole.arrays["applied_force"].numpy().copy()
+        target, force = numbers(whole, "pin_target"), numbers(whole, "applied_force")
         for place in (0.5 * (before + target), target):
             fine.run(1)
-            np.testing.assert_allclose(fine.arrays["pin_target"].numpy(), place, rtol=0, atol=1e-17)
-            np.testing.assert_array_equal(fine.arrays["applied_force"].numpy(), force)
+            np.testing.assert_allclose(numbers(fine, "pin_target"), place, rtol=0, atol=1e-17)
+            np.testing.assert_array_equal(numbers(fine, "applied_force"), force)
         before = target
         np.testing.assert_allclose(target, path[min(k, 3)], rtol=0, atol=1e-17)
 
@@ -524,8 +533,8 @@ def test_what_the_lines_say():
 
 def test_what_sliding_leaves_out_is_named_once():
     changes = [ablation.Change(name, 1e-9, 0.1, 0.0) for name in ("friction", "parallel", "bending", "sliding")]
-    assert ablation._unneeded(changes, 1e-3) == ("bending", "sliding")
-    assert ablation._unneeded(changes[:3], 1e-3) == ("friction", "parallel", "bending")
+    assert unneeded(changes, 1e-3) == ("bending", "sliding")
+    assert unneeded(changes[:3], 1e-3) == ("friction", "parallel", "bending")
 
 
 def test_the_command_takes_a_scene_from_a_file(tmp_path, capsys):
@@ -574,7 +583,7 @@ def test_wrong_arguments_of_the_command(arguments, named, tmp_path, monkeypatch,
 
 @pytest.mark.slow
 def test_chart_4_from_the_command(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(motions.MOTIONS, "hung", SHORT)
+    monkeypatch.setitem(motions.MOTIONS, "hung", short())
     output, plot = tmp_path / "t.csv", tmp_path / "t.png"
     terms.main(["--size", "3", "--motions", "hung", "--repeats", "1", "--output", str(output), "--plot", str(plot)])
     with open(output, newline="") as file:
@@ -752,11 +761,11 @@ def test_iterations_are_those_of_the_residual_asked_for():
     state = iterations.jittered(cloth, 0.15, False)
     found = {name: iterations.count(scene, state, 1e-3, name, 1000) for name in iterations.PRECONDITIONERS}
     for preconditioner, counts in found.items():
-        simulator = wy.Simulator(scene, step=1e-3, integrator="linear", preconditioner=preconditioner, tolerance=1e-6)
-        simulator.model.energy.on = False
+        options = {"preconditioner": preconditioner, "tolerance": 1e-6, "energy_watch": False}
+        simulator = wy.Simulator(scene, step=1e-3, integrator="linear", **options)
         simulator.state = state
         simulator.run(1)
-        assert counts["to r"] == int(simulator.arrays["iterations"].numpy()[0])
+        assert counts["to r"] == int(numbers(simulator, "iterations")[0])
         # b has the momentum that the start has too
         assert 0 < counts["to b"] <= counts["to r"] + 20
     assert iterations.count(scene, state, 1e-3, "multilevel", 3) == {"to r": "> 3", "to b": "> 3"}

@@ -58,10 +58,10 @@ def test_a_read_only_folder_is_found_before():
 def test_a_process_that_is_ended_leaves_nothing(tmp_path, number):
     code = (
         "import signal, sys, time\n"
-        "from warp_yarn.io.files import whole_file\n"
+        "from warp_yarn.io.files import atomic_write\n"
         # a shell's background jobs ignore it
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "with whole_file(sys.argv[1]) as temporary:\n"
+        "with atomic_write(sys.argv[1]) as temporary:\n"
         "    temporary.write_text('half')\n"
         "    print('begun', flush=True)\n"
         "    time.sleep(60)\n"
@@ -82,11 +82,11 @@ def test_others_plans_for_sigterm_are_kept(tmp_path):
         pytest.skip("Windows has no SIGTERM to send")
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
-        with files.whole_file(tmp_path / "a.txt") as temporary:
+        with files.atomic_write(tmp_path / "a.txt") as temporary:
             assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
             temporary.write_text("whole")
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        with files.whole_file(tmp_path / "a.txt") as temporary:
+        with files.atomic_write(tmp_path / "a.txt") as temporary:
             assert callable(signal.getsignal(signal.SIGTERM))
             temporary.write_text("again")
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -96,6 +96,6 @@ def test_others_plans_for_sigterm_are_kept(tmp_path):
 
 
 def test_what_a_write_raises_names_the_file(tmp_path):
-    with pytest.raises(OSError, match=r"File too large: .*a\.npz"), files.whole_file(tmp_path / "a.npz"):
+    with pytest.raises(OSError, match=r"File too large: .*a\.npz"), files.atomic_write(tmp_path / "a.npz"):
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
     assert os.listdir(tmp_path) == []

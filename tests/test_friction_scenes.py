@@ -1,5 +1,7 @@
 """Friction that sticks and slips: a yarn pulled out of a weave, and yarns under a steady pull."""
 
+from __future__ import annotations
+
 import functools
 
 import numpy as np

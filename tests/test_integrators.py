@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from test_gradients import GROUPS, WIND, cloth, jittered, scaled, scene_for
-from warp_yarn.kernels.core.status import STALLED
+from inputs import GROUPS, WIND, cloth, jittered, scaled, scene_for
+from internals import fails_at_first, left_of_the_last_stage, newton_tolerance, numbers, put, strips
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
@@ -219,7 +219,7 @@ def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
     )
 
     def tolerance(step: float, **options: object) -> float:
-        return wy.Simulator(wy.Scene(fabric), step=step, **options).model.newton_tolerance_at(step)
+        return newton_tolerance(wy.Simulator(wy.Scene(fabric), step=step, **options), step)
 
     assert tolerance(4.001 * wave) == 2e-2
     assert tolerance(wave) == pytest.approx(2e-2 / 16, rel=1e-12)
@@ -233,16 +233,12 @@ def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
 def test_the_iteration_that_is_not_looked_at_gets_there(step: float) -> None:
     """What is left at the end of each step's last stage, by another step of the iteration, after all."""
     simulator = wy.Simulator(wy.paper.hung_cloth("plain", 5, 5, (1, 2)), step=step)
-    arrays, left, skipped = simulator.arrays, [], 0
-    arrays["inner_tolerance"].fill_(1e-10)
+    left, skipped = [], 0
+    put(simulator, "inner_tolerance", 1e-10)
     for _ in range(20):
         simulator.run(1)
-        skipped += int(arrays["take_unchecked_step"].numpy()[0])
-        change = float(arrays["change"].numpy()[0])
-        simulator.integrator.newton.evaluate(matrix=True)
-        simulator.integrator.newton.solve_direction(1)
-        slope = float(arrays["directional_derivative"].numpy()[0])
-        left.append(np.sqrt(slope) / change / simulator.model.newton_tolerance_at(step))
+        skipped += int(numbers(simulator, "take_unchecked_step")[0])
+        left.append(left_of_the_last_stage(simulator))
     assert skipped >= 5
     # contraction is not the same from one iteration to the next, least of all in long steps; the worst was at 7 times
     assert np.median(left) < (2.0 if step > 1e-3 else 1.0) and max(left) < 10.0
@@ -262,18 +258,6 @@ def colliding(speed: float) -> tuple[wy.Scene, wy.State]:
     rates = np.zeros((fabric.nodes, 2))
     rates[5, 0], rates[6, 0] = speed, -speed
     return wy.Scene(fabric), wy.State(fabric.position, fabric.euler, np.zeros((fabric.nodes, 3)), rates)
-
-
-def fails_at_first(simulator: wy.Simulator, largest: float) -> None:
-    """Makes a simulator fail in its first step, wherever it tries more of it at once than so much [s]."""
-    advance, arrays = simulator.integrator.advance, simulator.arrays
-
-    def attempt() -> None:
-        if arrays["counters"].numpy()[1] == 0 and arrays["step_size"].numpy()[0] > largest:
-            arrays["status"].assign(np.array([STALLED, -1, 0], dtype=np.int32))
-        advance()
-
-    simulator.integrator.advance = attempt
 
 
 def test_a_step_that_fails_is_made_in_parts() -> None:
@@ -338,7 +322,7 @@ def test_two_cores_do_what_one_does(method: str) -> None:
     scene = wy.paper.hung_cloth("twill", 7, 19, (1, 2))
     one = wy.Simulator(scene, integrator=method).run(4)
     two = wy.Simulator(scene, integrator=method, threads=2)
-    assert two.model.threads.count == 2
+    assert strips(two) == 2
     # the same operations on every node; sums over nodes are added in another order
     assert np.abs(two.run(4).position - one.position).max() < 1e-12 * scene.cloth.spacing
 
@@ -347,4 +331,4 @@ def test_threads_that_cannot_help_are_refused() -> None:
     with pytest.raises(wy.InputError, match=r"threads = 2, must be 1 .*'jacobi'"):
         wy.Simulator(scene_for("plain", 1), preconditioner="jacobi", threads=2)
     # a cloth too narrow to be shared is solved by one
-    assert wy.Simulator(scene_for("plain", 1), threads=2).model.threads.count == 1
+    assert strips(wy.Simulator(scene_for("plain", 1), threads=2)) == 1

@@ -43,6 +43,7 @@ def test_shear_is_learned_from_the_middle_of_a_motion_with_paths():
     assert result.problem is problem and result.step_share < 1e-3
 
 
+@pytest.mark.slow
 def test_tasks_and_results_go_to_another_process_and_back(data):
     problem = problem_of(data)
     for made in (copy.deepcopy(problem), pickle.loads(pickle.dumps(problem))):

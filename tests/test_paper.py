@@ -3,28 +3,27 @@
 import csv
 import dataclasses
 import importlib.util
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.integrate
-from scripts import load
+from scripts import Later, beside, load
 
 import warp_yarn as wy
 from warp_yarn.calibration.learn import with_values
 from warp_yarn.integrators import INTEGRATORS
 
 paper = load("benchmarks/paper.py")
-bayesian, sheet, ground_truth = paper.bayesian, paper.sheet, sys.modules["ground_truth"]
-parameters, prediction = paper.paper_parameters, paper.paper_prediction
+bayesian, sheet, ground_truth = (beside(paper, name) for name in ("bayesian", "sheet", "ground_truth"))
+parameters, prediction = beside(paper, "paper_parameters"), beside(paper, "paper_prediction")
 
-FABRIC = ground_truth.PLAIN
+FABRIC = Later(lambda: ground_truth.PLAIN)
 
 needs_bayesian = pytest.mark.skipif(
     importlib.util.find_spec("bayes_opt") is None, reason="needs the package bayesian-optimization"
 )
-needs_newton = pytest.mark.skipif(not sheet.available(), reason="needs Newton")
+needs_newton = pytest.mark.skipif(importlib.util.find_spec("newton") is None, reason="needs Newton")
 
 
 def read(path: Path) -> list[dict[str, str]]:

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from test_gradients import cloth
-from test_integrators import fails_at_first
+from inputs import cloth
+from internals import errors_of_accepted_parts, fails_at_first
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
@@ -43,8 +43,8 @@ def test_the_estimate_is_the_error_of_the_step(swinging: wy.State, step: float) 
     fine = hung(step / 64, **EXACT)
     fine.state = swinging
     error = farthest(once, fine.run(64).position[-1])
-    assert simulator.parts.error() == pytest.approx(error, rel=0.2 if step < 2e-4 else 1.0)
-    assert simulator.parts.error() > 0.5 * error
+    assert simulator.substepping.error() == pytest.approx(error, rel=0.2 if step < 2e-4 else 1.0)
+    assert simulator.substepping.error() > 0.5 * error
 
 
 def test_parts_keep_to_the_allowed_error(swinging: wy.State) -> None:
@@ -56,18 +56,9 @@ def test_parts_keep_to_the_allowed_error(swinging: wy.State) -> None:
     for allowed in (1e-2, 1e-3, 1e-4):
         simulator = hung(5e-3, step_error=allowed)
         simulator.state = swinging
-        parts, accepted = simulator.parts, []
-        accepts = parts._accepts
-
-        def looked_at(size: float, accepts=accepts, accepted=accepted, parts=parts) -> bool:
-            good = accepts(size)
-            if good:
-                accepted.append(parts.error())
-            return good
-
-        parts._accepts = looked_at
+        accepted = errors_of_accepted_parts(simulator)
         errors.append(farthest(simulator.run(1).position[-1], converged))
-        assert len(accepted) == parts.made > 1
+        assert len(accepted) == simulator.substepping.accepted > 1
         # nor are they far smaller than they need be
         assert 0.2 * allowed < max(accepted) / simulator.scene.cloth.spacing <= allowed
         assert simulator.split_steps == {}
@@ -79,16 +70,16 @@ def test_parts_add_up_to_the_step() -> None:
     fabric = cloth(4, 4)
     # springs of friction that are not strained at rest move by 1e-10 m
     simulator = wy.Simulator(wy.Scene(fabric, sliding=False), step=4e-3, step_error=1e-6, **EXACT)
-    simulator.parts.size = 0.1
+    simulator.substepping.next_size = 0.1
     fallen = simulator.run(3).position[-1] - fabric.position
     # SDIRK2 is exact for a parabola
     assert fallen[:, 2] == pytest.approx(np.full(fabric.nodes, -0.5 * 9.8 * 0.012**2), rel=1e-6)
-    assert simulator.parts.size == pytest.approx(2.0)
+    assert simulator.substepping.next_size == pytest.approx(2.0)
     target = fabric.position[[0]][None] + (0.0, 0.0, 2e-4)
     scene = wy.Scene(fabric, gravity=None, pins=[0], pin_path=target, pin_stiffness=None)
     simulator = wy.Simulator(scene, step_error=1e-4)
     after = simulator.run(1)[1]
-    assert simulator.parts.made > 1
+    assert simulator.substepping.accepted > 1
     assert after.position[0] == pytest.approx(target[0, 0], abs=1e-15)
 
 
@@ -96,7 +87,7 @@ def test_parts_that_cannot_be_made_are_halved() -> None:
     simulator = wy.Simulator(wy.Scene(cloth(4, 4), wind=wy.Wind(velocity=(0.0, 5.0, 0.0))), step_error=1e9)
     fails_at_first(simulator, 3e-4)
     assert len(simulator.run(1)) == 2
-    assert simulator.parts.tried <= 0.3 and simulator.parts.rejected >= 2
+    assert simulator.substepping.last_size <= 0.3 and simulator.substepping.rejected >= 2
 
 
 def test_an_error_that_no_part_keeps_to_ends_the_run() -> None:

@@ -10,6 +10,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingCore
+from internals import Camera, Picture, pyvista, resampled
 from waving import BLUE, RED, waving
 
 import warp_yarn as wy
@@ -23,7 +24,7 @@ SIZE = (160, 120)
 @pytest.fixture(scope="module")
 def drawing():
     try:
-        render._pyvista()
+        pyvista()
     except wy.InputError as error:
         pytest.skip(str(error))
 
@@ -76,7 +77,7 @@ def test_the_same_picture_is_the_same(drawing, tmp_path, size):
         wy.write_png(tmp_path / "a.png", waving(), frame=frame, size=size)
         images.append(imageio.imread(tmp_path / "a.png"))
     assert np.array_equal(images[0], images[2]) and not np.array_equal(images[0], images[1])
-    with render._Picture(waving(frames=1), size, render.VIEW) as picture:
+    with Picture(waving(frames=1), size, render.VIEW) as picture:
         assert all(np.array_equal(picture.drawn(0), images[0]) for _ in range(3))
 
 
@@ -105,7 +106,7 @@ def test_the_upper_yarn_hides_the_lower_one(drawing, tmp_path):
     trajectory.position[0] = trajectory.cloth.position
     wy.write_png(tmp_path / "a.png", trajectory, size=(201, 201), view=(0.0, -1e-3, 1.0))
     image = imageio.imread(tmp_path / "a.png")[..., :3].astype(float)
-    camera = render._Camera.framing(geometry.strands(trajectory)[0].points[0], 3e-4, 1.0, (0.0, -1e-3, 1.0))
+    camera = Camera.framing(geometry.strands(trajectory)[0].points[0], 3e-4, 1.0, (0.0, -1e-3, 1.0))
     # Orthographic to 2 %; a yarn is 12 pixels wide.
     across = (trajectory.cloth.position @ camera.axes.T - camera.centre)[:, :2]
     pixel = 100.5 + across * [1, -1] * 100.5 / (camera.distance * np.tan(np.radians(0.5 * render.LENS)))
@@ -118,7 +119,7 @@ def test_the_upper_yarn_hides_the_lower_one(drawing, tmp_path):
 @pytest.mark.parametrize("aspect", [0.5, 2.0])
 def test_camera_has_every_frame_in_view_and_is_no_farther_than_that(view, aspect):
     points = np.concatenate([part.points.reshape(-1, 3) for part in geometry.strands(waving(frames=6))])
-    camera = render._Camera.framing(points, 3e-4, aspect, view)
+    camera = Camera.framing(points, 3e-4, aspect, view)
     eye = camera.world([0.0, 0.0, camera.distance])
     toward = np.array(view) / np.linalg.norm(view)
     right = np.cross([0.0, 0.0, 1.0], toward)
@@ -151,7 +152,7 @@ def test_movie_moves_steadily_and_its_camera_stands(movie):
 
 def test_a_movie_is_from_the_first_to_the_last_frame(movie):
     trajectory, _, pictures = movie
-    with render._Picture(trajectory, SIZE, render.VIEW) as picture:
+    with Picture(trajectory, SIZE, render.VIEW) as picture:
         last, first = picture.drawn(7).astype(float), picture.drawn(0).astype(float)
     assert np.abs(pictures[-1] - last).mean() < 0.2 * np.abs(pictures[-1] - first).mean()
     assert np.abs(pictures[0] - first).mean() < 0.2 * np.abs(pictures[0] - last).mean()
@@ -160,14 +161,14 @@ def test_a_movie_is_from_the_first_to_the_last_frame(movie):
 def test_pictures_of_a_movie_are_along_straight_lines_between_frames():
     position = np.array([[[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], [[1.0, 4.0, 0.0]]])
     expected = [[0, 0, 0], [0.75, 0, 0], [1, 2, 0]]
-    np.testing.assert_allclose(render._resampled(position, 0.75)[:, 0], expected, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(resampled(position, 0.75)[:, 0], expected, rtol=0, atol=1e-15)
     # Neither the last frame is lost to rounding, nor is one past it made up.
     long = np.arange(501.0)[:, None, None]
     for rate, slowdown, count in ((24, 10, 121), (30, 1, 16), (30, 20, 301), (25, 7, 88)):
-        pictures = render._resampled(long, 1.0 / (rate * slowdown) / 1e-3)
+        pictures = resampled(long, 1.0 / (rate * slowdown) / 1e-3)
         assert len(pictures) == count
         np.testing.assert_allclose(pictures[:, 0, 0], np.arange(count) * 1e3 / (rate * slowdown), rtol=1e-12)
-    assert len(render._resampled(position[:1], 0.3)) == 1
+    assert len(resampled(position[:1], 0.3)) == 1
 
 
 def test_progress_bar_on_request_only(drawing, tmp_path, capsys):
@@ -183,8 +184,8 @@ def fails(*_):
 @pytest.mark.parametrize("write, name", [(wy.write_png, "a.png"), (wy.write_mp4, "a.mp4")])
 def test_a_write_that_fails_leaves_what_was_there(drawing, tmp_path, monkeypatch, write, name):
     (tmp_path / name).write_bytes(b"precious")
-    drawn = render._Picture.drawn
-    monkeypatch.setattr(render._Picture, "drawn", lambda self, k, *path: fails() if k or path else drawn(self, k))
+    drawn = Picture.drawn
+    monkeypatch.setattr(Picture, "drawn", lambda self, k, *path: fails() if k or path else drawn(self, k))
     with pytest.raises(OSError, match="no space left"):
         write(tmp_path / name, waving(frames=8), size=SIZE)
     assert os.listdir(tmp_path) == [name]

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from test_gradients import WIND, cloth, gradcheck, jittered, scene_for
+from cases import quick
+from inputs import WIND, cloth, gradcheck, jittered, scene_for
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
@@ -171,7 +172,7 @@ def check_sequence(rollout: wt.Rollout, fresh: Callable[[], wt.Rollout], seed: i
 
 # Sequences that are interrupted where a run, a step in parts or a failure would leave something behind.
 @pytest.mark.parametrize(("seed", "every"), [(5, 2), (11, 1)])
-@pytest.mark.parametrize("method", INTEGRATORS)
+@pytest.mark.parametrize("method", quick(INTEGRATORS, "linear"))
 def test_a_rollout_answers_as_a_fresh_one(method: str, seed: int, every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def fresh() -> wt.Rollout:
         return wt.Rollout(scene(), STEPS, integrator=method, checkpoint_every=every)
@@ -226,6 +227,7 @@ def test_rollouts_in_threads_answer_as_alone(shared: bool) -> None:
 LEARN = {"stretch": (1e4, 1e6), "friction": (0.0, 2.0), "forces": (-1e-3, 1e-3)}
 
 
+@pytest.mark.slow
 def test_a_fabric_answers_as_a_fresh_one(monkeypatch: pytest.MonkeyPatch) -> None:
     def fresh() -> wt.Fabric:
         return wt.Fabric(scene(), STEPS, learn=LEARN)
@@ -285,7 +287,7 @@ def in_parts(rollout: wt.Rollout, parts: int, **inputs: torch.Tensor) -> wt.Fram
 
 
 @pytest.mark.parametrize("every", [1, 2])
-@pytest.mark.parametrize("method", INTEGRATORS)
+@pytest.mark.parametrize("method", quick(INTEGRATORS, "linear", "sdirk2"))
 def test_a_run_in_parts_is_the_same_as_at_once(method: str, every: int) -> None:
     options = {"integrator": method, "checkpoint_every": every, **EXACT}
     whole, part = wt.Rollout(scene(6), 6, **options), wt.Rollout(scene(6), 2, **options)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from internals import a_step_at_a_time, put
 from pxr import Usd, UsdGeom
 from scripts import ROOT, exit_code, load, samples
 
@@ -111,6 +112,7 @@ def test_a_recording_without_a_scene_is_not_resumed(usd, tmp_path, capsys):
     assert "has no scene to go on with" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_with_code_2_and_keeps_the_frames(usd, tmp_path, capsys, monkeypatch):
     resource = pytest.importorskip("resource")
     (tmp_path / "temporary").mkdir()
@@ -148,7 +150,7 @@ def test_an_output_folder_that_cannot_be_written_is_found_before_the_run(monkeyp
     assert "/proc/self/hang.usdc: nothing can be written" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("encoding", ["cp932", "ascii"])
+@pytest.mark.parametrize("encoding", [pytest.param("cp932", marks=pytest.mark.slow), "ascii"])
 def test_output_does_not_depend_on_the_terminal(usd, encoding):
     """Nor does what is written."""
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "LC_ALL": "C"}
@@ -171,12 +173,12 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
 
 
 def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, capsys):
-    monkeypatch.setattr("warp_yarn.simulation.simulator.CHUNK_BYTES", 0)  # a step at a time
+    a_step_at_a_time(monkeypatch)
     run = wy.Simulator.run_chunk
 
     def storm(simulator, steps):
         if simulator.steps_done == 3:
-            simulator.arrays["wind_velocity"].fill_(np.inf)
+            put(simulator, "wind_velocity", np.inf)
         return run(simulator, steps)
 
     monkeypatch.setattr(wy.Simulator, "run_chunk", storm)
@@ -196,7 +198,7 @@ def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, caps
 
 
 def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
-    monkeypatch.setattr("warp_yarn.simulation.simulator.CHUNK_BYTES", 0)  # a step at a time
+    a_step_at_a_time(monkeypatch)
     run, calls = wy.Simulator.run_chunk, []
 
     def interrupted(simulator, steps):

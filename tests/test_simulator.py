@@ -7,7 +7,8 @@ import pickle
 
 import numpy as np
 import pytest
-from cases import CLOTHS, make_state, simulator
+from cases import CLOTHS, make_state, quick, simulator
+from internals import numbers, put
 
 import warp_yarn as wy
 
@@ -24,7 +25,7 @@ def cloth(rows: int, columns: int, **options) -> wy.Cloth:
 @pytest.mark.parametrize("preconditioner", ["incomplete", "jacobi"])
 @pytest.mark.parametrize("sliding", [True, False], ids=["sliding", "locked"])
 @pytest.mark.parametrize("held", [True, False], ids=["exact pins", "springs"])
-@pytest.mark.parametrize("name", CLOTHS)
+@pytest.mark.parametrize("name", quick(CLOTHS, "plain"))
 def test_step_is_a_dense_solve(name: str, held: bool, sliding: bool, preconditioner: str) -> None:
     c = simulator(name, None).scene.cloth
     pins = c.corners("top")
@@ -40,7 +41,7 @@ def test_step_is_a_dense_solve(name: str, held: bool, sliding: bool, preconditio
     sim = wy.Simulator(scene, integrator="linear", tolerance=1e-14, preconditioner=preconditioner)
     state = make_state(c, "random", sliding)
     sim.state = state
-    sim.arrays["pin_target"].assign(target[0])
+    put(sim, "pin_target", target[0])
     system = sim.system()
     matrix, free = system.dense(), system.free
     expected = np.concatenate([state.velocity.ravel(), state.euler_velocity.ravel()])[: len(free)]
@@ -166,8 +167,8 @@ def test_a_term_that_is_left_out_has_no_arrays_and_does_nothing() -> None:
     sim = wy.Simulator(scene)
     assert scene.terms == ("mass", "stretch", "gravity")
     absent = ("normal", "contact_load", "euler_force", "upper_xs", "anchor", "euler_velocity", "corner_jams")
-    assert all(sim.arrays[name] is None for name in absent)
-    assert sim.arrays["upper_xx"].size == 2 * c.nodes  # the next crossings of each yarn alone
+    assert all(numbers(sim, name) is None for name in absent)
+    assert len(numbers(sim, "upper_xx")) == 2 * c.nodes  # the next crossings of each yarn alone
     assert set(sim.forces()) == {"stretch", "gravity"}
     trajectory = sim.run(3)
     assert np.array_equal(trajectory.euler[-1], c.euler) and not trajectory.euler_velocity.any()

@@ -187,6 +187,7 @@ def test_more_threads_than_cores_warn():
         wy.Simulator(scene(), threads=cores + 1)
 
 
+@pytest.mark.slow
 def test_threads_that_draw_at_once(tmp_path):
     """In a process of its own, where nothing has loaded what draws."""
     code = (

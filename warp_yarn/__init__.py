@@ -59,7 +59,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> ModuleType:
-    """``warp_yarn.torch``, imported when it is asked for."""
+    """Imports ``warp_yarn.torch`` when it is asked for."""
     if name != "torch":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

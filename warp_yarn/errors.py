@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from .moved import renamed
+
 
 class WarpYarnError(Exception):
     """Every error that warp_yarn raises on purpose."""
@@ -56,7 +58,7 @@ class GradientError(WarpYarnError, RuntimeError):
 
 
 def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """value as a new float64 array of the shape (None: any length), or an InputError."""
+    """Gives value as a new float64 array of the shape (None: any length), or an InputError."""
     try:
         given = np.asarray(value)
         if given.dtype.kind not in "biuf":  # NumPy would read text, and drop imaginary parts
@@ -73,8 +75,8 @@ def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.nda
     return array
 
 
-def number(name: str, value: Any, *, above: float | None = None, least: float | None = None) -> float:
-    """value as a finite float in the open (above) or closed (least) range, or an InputError."""
+def real(name: str, value: Any, *, above: float | None = None, least: float | None = None) -> float:
+    """Gives value as a finite float in the open (above) or closed (least) range, or an InputError."""
     allowed = "finite"
     if above is not None:
         allowed = f"finite and above {above:g}"
@@ -91,8 +93,8 @@ def number(name: str, value: Any, *, above: float | None = None, least: float | 
     return result
 
 
-def whole(name: str, value: Any, *, least: int, most: int | None = None) -> int:
-    """value as an int of at least `least` and at most `most`, or an InputError."""
+def integer(name: str, value: Any, *, least: int, most: int | None = None) -> int:
+    """Gives value as an int of at least `least` and at most `most`, or an InputError."""
     wrong = isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least
     if wrong or (most is not None and value > most):
         allowed = f"at least {least}" if most is None else f"from {least} to {most}"
@@ -101,7 +103,7 @@ def whole(name: str, value: Any, *, least: int, most: int | None = None) -> int:
 
 
 def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
-    """value, or an InputError where it is none of the allowed names."""
+    """Gives value, or an InputError where it is none of the allowed names."""
     names = list(allowed)
     if value not in names:
         raise InputError(f"{name} = {value!r}, must be one of {', '.join(names)}")
@@ -109,7 +111,7 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
 
 
 def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:
-    """value as an int32 array of distinct indices below count, or an InputError."""
+    """Gives value as an int32 array of distinct indices below count, or an InputError."""
     try:
         array = np.atleast_1d(np.asarray(value))
     except ValueError:  # ragged
@@ -124,3 +126,6 @@ def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:
     if len(np.unique(array)) != len(array):
         raise InputError(f"{name} names a {what} twice: {array.tolist()}")
     return array.astype(np.int32)
+
+
+__getattr__ = renamed(__name__, {"number": "real", "whole": "integer"})

@@ -1,11 +1,11 @@
-"""Where modules were before they had rooms. The old names keep working for a release, with a DeprecationWarning."""
+"""Old names of modules and of what is in them, which keep working for a release, with a DeprecationWarning."""
 
 import importlib
 import importlib.abc
 import importlib.machinery
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -61,3 +61,29 @@ def install() -> None:
     """Lets old names be imported."""
     if not any(isinstance(finder, _Old) for finder in sys.meta_path):
         sys.meta_path.append(_Old())
+
+
+def renamed(module: str, names: dict[str, str]) -> Callable[[str], Any]:
+    """Makes the ``__getattr__`` of a module that finds what it has, {old name: new name}, by the old names too."""
+
+    def find(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warnings.warn(f"{module}.{name} is {names[name]} now", DeprecationWarning, stacklevel=2)
+        return getattr(sys.modules[module], names[name])
+
+    return find
+
+
+def renamed_attribute(old: str, new: str) -> Any:
+    """Makes the property by which an object's attribute is found, and set, by its old name too."""
+
+    def get(self: Any) -> Any:
+        warnings.warn(f"{old} is {new} now", DeprecationWarning, stacklevel=2)
+        return getattr(self, new)
+
+    def put(self: Any, value: Any) -> None:
+        warnings.warn(f"{old} is {new} now", DeprecationWarning, stacklevel=2)
+        setattr(self, new, value)
+
+    return property(get, put, doc=f"The old name of ``{new}``.")

@@ -16,7 +16,7 @@ import warp as wp
 from .description.scene import checked_parameter
 from .description.topology import Topology
 from .device.exclusive import ALONE
-from .errors import InputError, choice, number, whole
+from .errors import InputError, choice, integer, real
 from .integrators import INTEGRATORS
 from .integrators.stage import StageMethod
 from .kernels import TERMS, Term, TermParameter, Variant, build, build_term, own, parameters
@@ -117,8 +117,8 @@ def register_integrator(method: type) -> None:
     if given.fallback is not None:
         choice("method.fallback", given.fallback, INTEGRATORS)
     if of_stages:
-        whole("method.stages", given.stages, least=1, most=2)
-        number("method.fraction", given.fraction, above=0.0)
+        integer("method.stages", given.stages, least=1, most=2)
+        real("method.fraction", given.fraction, above=0.0)
         # a single stage that ends the step covers it all; one that is carried is carried over all of it
         covered = given.carried if given.stages == 1 and given.carried else given.fraction + given.carried
         if abs(covered - 1.0) > 1e-12:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..io.files import whole_file
+from ..io.files import atomic_write
 from .levenberg_marquardt import Iteration, LevenbergMarquardt
 
 SAME_LOSS = 1e-6
@@ -42,7 +42,7 @@ def save(search: LevenbergMarquardt, path: Path) -> None:
         "scale": search.scale,
         "jacobian": known,
     }
-    with whole_file(path) as temporary, open(temporary, "wb") as file:
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **identity(search), **state, **{f"history_{name}": rows for name, rows in history.items()})
 
 

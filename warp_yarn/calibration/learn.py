@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from ..errors import GradientError, InputError, number, whole
+from ..errors import GradientError, InputError, integer, real
 from . import checkpoint as checkpoints
 from .differences import missed_by_the_step
 from .levenberg_marquardt import Iteration, LevenbergMarquardt
@@ -142,8 +142,8 @@ def learn(
     Every exception, KeyboardInterrupt too, has the iterations until then as ``iterations`` [list of Iteration]: the
     last one's values are the best so far.
     """
-    whole("iterations", iterations, least=0)
-    resolution, halvings = number("resolution", resolution, above=0.0), whole("halvings", halvings, least=0)
+    integer("iterations", iterations, least=0)
+    resolution, halvings = real("resolution", resolution, above=0.0), integer("halvings", halvings, least=0)
     search = LevenbergMarquardt(problem, resolution, halvings)
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.suffix != ".npz":

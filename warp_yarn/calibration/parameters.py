@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..description.scene import Scene
-from ..errors import InputError, number
+from ..errors import InputError, real
 from ..simulation.state import CLOTH_NUMBERS
 
 OF_YARNS = ("density", "stretch", "bend")
@@ -42,7 +42,7 @@ class Parameter:
 
     def __post_init__(self) -> None:
         for end in ("low", "high", "start"):
-            number(f"{self.name}: {end}", getattr(self, end))
+            real(f"{self.name}: {end}", getattr(self, end))
         if not self.low < self.high:
             raise InputError(f"{self.name}: low = {self.low:g}, must be below high = {self.high:g}")
         if not self.low <= self.start <= self.high:

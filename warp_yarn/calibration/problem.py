@@ -20,7 +20,7 @@ import torch
 
 from ..description.scene import Scene
 from ..device.arrays import STATE_TYPES
-from ..errors import InputError, finite_array, number, whole
+from ..errors import InputError, finite_array, integer, real
 from ..gradients.rollout import Rollout
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, Trajectory
@@ -100,7 +100,7 @@ class CalibrationProblem:
         self.path = float(np.sqrt(np.mean(np.linalg.norm(paths, axis=2).sum(axis=0) ** 2)))
         self._pins_at_start = target.position[0, scene.pins].copy()
         self._state = {name: torch.as_tensor(getattr(self.initial, name)) for name in FIELDS}
-        self._prepare(1 if step is None else steps_per_frame(self.frame_time, number("step", step, above=0.0)))
+        self._prepare(1 if step is None else steps_per_frame(self.frame_time, real("step", step, above=0.0)))
         self.cost = 1
         self.simulations = self.gradients = 0
 
@@ -225,8 +225,8 @@ class CalibrationProblem:
         Raises:
             SimulationError: a step that could not be made; its trajectory has every step before.
         """
-        count = len(self.positions) if frames is None else whole("frames", frames, least=1)
-        every = self.steps_per_frame * whole("refine", refine, least=1)
+        count = len(self.positions) if frames is None else integer("frames", frames, least=1)
+        every = self.steps_per_frame * integer("refine", refine, least=1)
         # The kernels that learning has compiled, though nothing is differentiated.
         options = {**self.options, "step": self.frame_time / every, "differentiable": True}
         simulator = Simulator(self._in_steps(self.scene_with(values), every, count), **options)
@@ -249,9 +249,9 @@ def chosen_frames(scene: Scene, target: Trajectory, frames: int | None, first: i
         )
     for name in FIELDS:
         finite_array(f"target.{name}", getattr(target, name), (len(target), scene.cloth.nodes, STATE_TYPES[name]))
-    first, every = whole("first", first, least=0), whole("every", every, least=1)
+    first, every = integer("first", first, least=0), integer("every", every, least=1)
     there = max(0, len(target) - 1 - first) // every
-    wanted = there if frames is None else whole("frames", frames, least=1)
+    wanted = there if frames is None else integer("frames", frames, least=1)
     if wanted > there or there == 0:
         raise InputError(
             f"frames = {wanted or 'all'}, first = {first}, every = {every}: the target has {len(target)} frames, "

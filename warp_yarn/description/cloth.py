@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, NoAttributeError, choice, finite_array, indices, number
+from ..errors import InputError, NoAttributeError, choice, finite_array, indices, real
 from .topology import Topology, rectangle
 from .weave import Weave
 
@@ -32,9 +32,9 @@ class Yarn:
 
     def __post_init__(self) -> None:
         keep = functools.partial(object.__setattr__, self)  # frozen
-        keep("density", number("density", self.density, above=0.0))
-        keep("stretch", number("stretch", self.stretch, least=0.0))
-        keep("bend", number("bend", self.bend, least=0.0))
+        keep("density", real("density", self.density, above=0.0))
+        keep("stretch", real("stretch", self.stretch, least=0.0))
+        keep("bend", real("bend", self.bend, least=0.0))
         if self.color is not None:
             color = finite_array("color", self.color, (3,))
             if color.min() < 0.0 or color.max() > 1.0:
@@ -144,23 +144,23 @@ class Cloth(Fixed):
             raise InputError(f"yarns = {yarns!r}, must be a list of at least one Yarn")
         self.warp = self._materials("warp", warp, weave.rows)
         self.weft = self._materials("weft", weft, weave.columns)
-        self.spacing = number("spacing", spacing, above=0.0)
-        self.radius = number("radius", radius, above=0.0)
+        self.spacing = real("spacing", spacing, above=0.0)
+        self.radius = real("radius", radius, above=0.0)
         if self.radius > 0.5 * self.spacing * (1.0 + 1e-12):
             raise InputError(
                 f"radius = {radius:g}, must be at most half the spacing ({0.5 * self.spacing:g}), or neighbouring "
                 "yarns overlap"
             )
-        self.shear = number("shear", shear, least=0.0)
-        self.friction = number("friction", friction, least=0.0)
-        self.friction_stiffness = number("friction_stiffness", friction_stiffness, above=0.0)
+        self.shear = real("shear", shear, least=0.0)
+        self.friction = real("friction", friction, least=0.0)
+        self.friction_stiffness = real("friction_stiffness", friction_stiffness, above=0.0)
         damping = friction_damping
         if damping is None:
             mass = np.mean([self.yarns[k].density for k in self.material]) * self.spacing
             damping = 2.0 * float(np.sqrt(self.friction_stiffness * mass))
-        self.friction_damping = number("friction_damping", damping, least=0.0)
-        self.friction_sharpness = number("friction_sharpness", friction_sharpness, above=0.0)
-        self.parallel_stiffness = number("parallel_stiffness", parallel_stiffness, least=0.0)
+        self.friction_damping = real("friction_damping", damping, least=0.0)
+        self.friction_sharpness = real("friction_sharpness", friction_sharpness, above=0.0)
+        self.parallel_stiffness = real("parallel_stiffness", parallel_stiffness, least=0.0)
         self.position = self._pose(pose)
         self._fix(
             weave=weave,
@@ -176,7 +176,7 @@ class Cloth(Fixed):
         return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"
 
     def same_as(self, other: Cloth) -> bool:
-        """Whether another one is made of the same, whatever their weaves are called."""
+        """Tells whether another one is made of the same, whatever their weaves are called."""
         return (
             np.array_equal(self.weave.flipped, other.weave.flipped)
             and [dataclasses.replace(yarn, color=None) for yarn in self.yarns]
@@ -210,7 +210,7 @@ class Cloth(Fixed):
         return np.stack([column, row], axis=1) * self.spacing
 
     def node(self, row: int, column: int) -> int:
-        """Index of a node; negative rows and columns count from the end."""
+        """Gives the index of a node; negative rows and columns count from the end."""
         rows, columns = self.weave.rows, self.weave.columns
         if not (isinstance(row, int | np.integer) and isinstance(column, int | np.integer)):
             raise InputError(f"node (row {row!r}, column {column!r}), must be two whole numbers")
@@ -219,7 +219,7 @@ class Cloth(Fixed):
         return int(column % columns + (row % rows) * columns)
 
     def corners(self, which: str = "all") -> list[int]:
-        """Nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
+        """Lists the nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
         choice("which", which, ("top", "bottom", "all"))
         top = [self.node(0, 0), self.node(0, -1)]
         bottom = [self.node(-1, 0), self.node(-1, -1)]

@@ -140,7 +140,7 @@ def levels(topology: Topology, stencil: int, free: np.ndarray) -> Levels:
 
 
 def _lines(place: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The nodes of every warp yarn, and of every weft yarn, in their order."""
+    """Lists the nodes of every warp yarn, and of every weft yarn, in their order."""
     result = []
     for yarn, along in (place.T, place.T[::-1]):
         order = np.lexsort((along, yarn))
@@ -149,7 +149,7 @@ def _lines(place: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def _kept(yarn: np.ndarray) -> np.ndarray:
-    """The yarns of a direction that the next level keeps: every second and the last, or all where they are few."""
+    """Picks the yarns of a direction that the next level keeps: every second and the last, or all of few."""
     yarns = np.unique(yarn)
     if len(yarns) <= FEWEST:
         return yarns
@@ -157,7 +157,8 @@ def _kept(yarn: np.ndarray) -> np.ndarray:
 
 
 def _interpolation(place: np.ndarray, kept: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parents [nodes, 4] and their weights, and the places of the coarse nodes [coarse, 2] by the kept yarns' count."""
+    """Finds the parents [nodes, 4] and their weights, and the places of the coarse nodes [coarse, 2] by the kept yarns'
+    count."""
     sides = []
     for d in range(2):
         # the place of a yarn between those that are kept
@@ -182,7 +183,7 @@ def _interpolation(place: np.ndarray, kept: list[np.ndarray]) -> tuple[np.ndarra
 def _galerkin(
     pairs: np.ndarray, up: np.ndarray, weight: np.ndarray, coarse: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What every block of R A Rᵀ is made of: its number on this level, the block below, and its weight."""
+    """Lists what every block of R A Rᵀ is made of: its number on this level, the block below, and its weight."""
     slot_of = _slot_table()
     a, b, source = pairs
     found = []
@@ -197,7 +198,7 @@ def _galerkin(
 
 
 def _slot_table() -> np.ndarray:
-    """The block of a coarse node for a neighbour that is (j − 2, i − 2) yarns away, or -1."""
+    """Numbers the block of a coarse node for a neighbour that is (j − 2, i − 2) yarns away, or -1."""
     slots = np.full((5, 5), -1, dtype=np.int32)
     slots[2, 2] = 0
     for k, (j, i) in enumerate(OFFSETS):
@@ -206,13 +207,13 @@ def _slot_table() -> np.ndarray:
 
 
 def _slots(place: np.ndarray) -> np.ndarray:
-    """Which block of the first of two nodes the second one is."""
+    """Finds which block of the first of two nodes the second one is."""
     apart = np.clip(place[None, :] - place[:, None], -3, 3) + 3
     return np.pad(_slot_table(), 1, constant_values=-1)[apart[..., 0], apart[..., 1]]
 
 
 def _coarse_pairs(coarse: np.ndarray, first: int) -> np.ndarray:
-    """Every pair (a, b) of coarse nodes with a block, and where it stands."""
+    """Lists every pair (a, b) of coarse nodes with a block, and where it stands."""
     index = np.full(coarse.max(axis=0) + 5, -1)
     j, i = coarse.T + 2
     every = np.arange(len(coarse))
@@ -228,7 +229,7 @@ def _coarse_pairs(coarse: np.ndarray, first: int) -> np.ndarray:
 
 
 def _grouped(items: list[tuple], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(group, value, weight) of many, group by group: where each begins, values and weights."""
+    """Sorts (group, value, weight) of many, group by group: where each begins, values and weights."""
     if not items:
         return np.zeros(count + 1, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros(0)
     group, value, weight = (np.concatenate(parts) for parts in zip(*items, strict=True))
@@ -238,7 +239,7 @@ def _grouped(items: list[tuple], count: int) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _joined(lines: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Lists of nodes, one behind the other, and where each begins."""
+    """Joins lists of nodes, one behind the other, and where each begins."""
     start = np.cumsum([0, *(len(line) for line in lines)])
     nodes = np.concatenate(lines) if lines else np.zeros(0)
     return start.astype(np.int32), nodes.astype(np.int32)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, indices, number
+from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
 from .cloth import Cloth, Fixed
 
@@ -32,8 +32,8 @@ class Wind:
         # copies: an array that the caller writes to again is not this wind
         keep = functools.partial(object.__setattr__, self)
         keep("velocity", tuple(finite_array("wind velocity", self.velocity, (3,)).tolist()))
-        keep("density", number("wind density", self.density, least=0.0))
-        keep("drag", number("wind drag", self.drag, least=0.0))
+        keep("density", real("wind density", self.density, least=0.0))
+        keep("drag", real("wind drag", self.drag, least=0.0))
 
 
 class Scene(Fixed):
@@ -82,7 +82,7 @@ class Scene(Fixed):
         self.gravity = None if gravity is None else finite_array("gravity", gravity, (3,))
         self.wind = wind
         self.pins = indices("pins", pins, cloth.nodes, "node")
-        self.pin_stiffness = None if pin_stiffness is None else number("pin_stiffness", pin_stiffness, above=0.0)
+        self.pin_stiffness = None if pin_stiffness is None else real("pin_stiffness", pin_stiffness, above=0.0)
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
@@ -137,7 +137,7 @@ class Scene(Fixed):
         return result
 
     def same_as(self, other: Scene) -> bool:
-        """Whether another one asks for the same motion."""
+        """Tells whether another one asks for the same motion."""
 
         def values(scene: Scene) -> list[np.ndarray]:
             missing = np.zeros(0)
@@ -153,7 +153,7 @@ class Scene(Fixed):
 
     @staticmethod
     def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
-        """{node: 3 numbers, or steps × 3}."""
+        """Gives {node: 3 numbers, or steps × 3}."""
         if forces is None:
             return {}
         if not isinstance(forces, Mapping):
@@ -171,7 +171,7 @@ class Scene(Fixed):
 
     @staticmethod
     def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
-        """[steps + 1, nodes with a force, 3]; the last row is what stays."""
+        """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
         steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
         path = np.zeros((steps + 1, len(forces), 3))
         for k, value in enumerate(forces.values()):
@@ -229,5 +229,5 @@ def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> A
         return tuple(finite_array(parameter.name, value, (3,)).tolist())
     if parameter.of == "yarn" and not np.isscalar(value):
         values = finite_array(parameter.name, value, (materials,)).tolist()
-        return tuple(number(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
-    return number(parameter.name, value, **parameter.range)
+        return tuple(real(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
+    return real(parameter.name, value, **parameter.range)

@@ -52,13 +52,13 @@ class Topology:
 
 
 def rectangle(weave: Weave) -> Topology:
-    """A whole rectangle of the weave; node index = column + row·columns."""
+    """Takes a whole rectangle of the weave; node index = column + row·columns."""
     rows, columns = weave.rows, weave.columns
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     row, column = np.indices((rows, columns), dtype=np.int32)
 
     def along(warp: tuple[np.ndarray, ...], weft: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Node tuples of the warp yarns and then the weft yarns, and the yarn of each."""
+        """Lists the node tuples of the warp yarns and then the weft yarns, and the yarn of each."""
         nodes = [np.stack([part.ravel() for part in parts], axis=1) for parts in (warp, weft)]
         yarns = [row.ravel()[nodes[0][:, 0]], rows + column.ravel()[nodes[1][:, 0]]]
         return np.concatenate(nodes), np.concatenate(yarns)

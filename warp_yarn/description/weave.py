@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, whole
+from ..errors import InputError, integer
 
 
 class Weave:
@@ -48,19 +48,19 @@ class Weave:
 
     @classmethod
     def plain(cls, *, rows: int, columns: int) -> Weave:
-        """Over one, under one."""
+        """Goes over one, under one."""
         j, i = _grid(rows, columns)
         return cls((i + j) % 2 == 1, "plain")
 
     @classmethod
     def twill(cls, *, rows: int, columns: int) -> Weave:
-        """Over two, under two, shifted by one from row to row."""
+        """Goes over two, under two, shifted by one from row to row."""
         j, i = _grid(rows, columns)
         return cls((i + j % 4) % 4 < 2, "twill")
 
     @classmethod
     def satin(cls, *, rows: int, columns: int) -> Weave:
-        """Under one, over three, the single crossings scattered."""
+        """Goes under one, over three, the single crossings scattered."""
         j, i = _grid(rows, columns)
         r = (j - 1) % 4
         return cls((i - 1 + 3 * (r // 2) + 2 * (r % 2)) % 4 == 0, "satin")
@@ -70,7 +70,7 @@ class Weave:
 
 
 def _grid(rows: int, columns: int) -> np.ndarray:
-    return np.indices((whole("rows", rows, least=3), whole("columns", columns, least=3)))
+    return np.indices((integer("rows", rows, least=3), integer("columns", columns, least=3)))
 
 
 WEAVES = {"plain": Weave.plain, "twill": Weave.twill, "satin": Weave.satin}

@@ -13,7 +13,7 @@ import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
-from ..errors import InputError, choice, number, whole
+from ..errors import InputError, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build
 from . import defaults
 from .arrays import Arrays
@@ -65,7 +65,7 @@ class Model:
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {scene!r}, must be a Scene")
         self.scene = scene
-        self.step_size = number("step", step, above=0.0)
+        self.step_size = real("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
         if preconditioner is None:
             preconditioner = defaults.preconditioner(scene, self.step_size)
@@ -73,14 +73,14 @@ class Model:
         exact = differentiable and precision == "double"
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
-        self.tolerance = number("tolerance", tolerance, above=0.0)
+        self.tolerance = real("tolerance", tolerance, above=0.0)
         if newton_tolerance is None and exact:
             newton_tolerance = defaults.EXACT
         given = newton_tolerance is not None
-        self._newton_tolerance = number("newton_tolerance", newton_tolerance, above=0.0) if given else None
+        self._newton_tolerance = real("newton_tolerance", newton_tolerance, above=0.0) if given else None
         if max_iterations is None:
             max_iterations = defaults.max_iterations(scene)
-        self.max_iterations = whole("max_iterations", max_iterations, least=1)
+        self.max_iterations = integer("max_iterations", max_iterations, least=1)
         self.device = _checked_device(device)
         for name in scene.terms:  # one may have been registered when the scene was made
             choice("scene.terms", name, TERMS)
@@ -93,7 +93,7 @@ class Model:
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
-        self.threads = Threads(self, whole("threads", threads, least=1))
+        self.threads = Threads(self, integer("threads", threads, least=1))
         self.arrays.put("tolerance", self.tolerance)
 
     def newton_tolerance_at(self, step: float) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from ..description.scene import Scene
-from ..errors import InputError, choice, number
+from ..errors import InputError, choice, real
 from .inputs import allowed_range, real_tensor
 from .rollout import Frames, Rollout
 
@@ -132,7 +132,7 @@ def _pair(name: str, pair: Any) -> tuple[float, float]:
         raise InputError(f"learn[{name!r}] = {pair!r}, must be two numbers, (lowest, highest)") from error
     # every value in between is allowed where the lowest is, or is just not
     least = next(iter(allowed_range(name).values()), None)
-    low, high = number(f"learn[{name!r}][0]", low, least=least), number(f"learn[{name!r}][1]", high)
+    low, high = real(f"learn[{name!r}][0]", low, least=least), real(f"learn[{name!r}][1]", high)
     if not low < high:
         raise InputError(f"learn[{name!r}] = ({low:g}, {high:g}), the second must be above the first")
     return low, high

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..errors import InputError, number
+from ..errors import InputError, real
 from ..kernels import TERMS, own, parameters
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
@@ -114,7 +114,7 @@ class Inputs:
             raise InputError(f"{name} is not finite: {tensor.detach()}")
         if allowed_range(name):
             at = int(tensor.argmin())
-            number(f"{name}[{at}]" if tensor.ndim else name, tensor.reshape(-1)[at].item(), **allowed_range(name))
+            real(f"{name}[{at}]" if tensor.ndim else name, tensor.reshape(-1)[at].item(), **allowed_range(name))
         # Whoever changes theirs in place before the backward pass shall not change this run's.
         return tensor.clone()
 

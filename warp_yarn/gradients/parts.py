@@ -72,11 +72,11 @@ class PartsRecorder:
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
         """Records for as long as a block lasts."""
-        self.simulator.parts.watcher = self._note
+        self.simulator.substepping.watcher = self._note
         try:
             yield
         finally:
-            self.simulator.parts.watcher = None
+            self.simulator.substepping.watcher = None
 
     def _note(self, method: Any, size: float, left: float) -> None:
         """Takes down a part that was made, whose end is the present state."""

@@ -15,7 +15,7 @@ import torch
 
 from ..description.scene import Scene
 from ..device.exclusive import ALONE
-from ..errors import GradientError, InputError, whole
+from ..errors import GradientError, InputError, integer
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 from .inputs import Inputs, refuse_transforms
@@ -80,8 +80,8 @@ class Rollout:
         **options: Any,
     ):
         self.scene = scene
-        self.steps = whole("steps", steps, least=1)
-        self.checkpoint_every = whole("checkpoint_every", checkpoint_every, least=1)
+        self.steps = integer("steps", steps, least=1)
+        self.checkpoint_every = integer("checkpoint_every", checkpoint_every, least=1)
         self.frames = np.arange(steps + 1) if frames is None else np.array(frames)
         if not are_in_order(self.frames, steps):
             raise InputError(
@@ -142,7 +142,7 @@ class Rollout:
             SimulationError: a step that could not be made.
         """
         refuse_transforms()
-        steps_done = whole("steps_done", steps_done, least=0)
+        steps_done = integer("steps_done", steps_done, least=0)
         if steps_done + self.steps > MOST_STEPS:
             raise InputError(f"steps_done = {steps_done}, must be at most {MOST_STEPS - self.steps}")
         values = self._inputs.by_yarn(state, inputs)

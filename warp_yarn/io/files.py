@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..errors import InputError
+from ..moved import renamed
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     """Gives a temporary path with the ending of `path`, and moves it there when the block ends without an error.
 
     A link is followed: what it leads to is replaced. SIGTERM ends the block as Ctrl-C does, and leaves nothing behind.
@@ -74,3 +75,6 @@ def _tidied_up() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+__getattr__ = renamed(__name__, {"whole_file": "atomic_write"})

@@ -60,7 +60,7 @@ class Published:
     trajectory: Trajectory
 
     def distance(self, position: np.ndarray, frame: int) -> tuple[float, float]:
-        """How far positions [nodes, 3] (m) are from those of a frame.
+        """Measures how far positions [nodes, 3] (m) are from those of a frame.
 
         Returns:
             The root mean square over the nodes of the distance [m], and that of the published displacement since
@@ -154,7 +154,7 @@ def _dataset(file: h5py.File, name: str) -> np.ndarray:
 
 
 def _record(file: h5py.File, name: str, fields: tuple[str, ...]) -> list[float]:
-    """The numbers of a dataset of one record."""
+    """Reads the numbers of a dataset of one record."""
     data = np.asarray(_dataset(file, name))
     missing = [field for field in fields if field not in (data.dtype.names or ())]
     if missing:
@@ -169,7 +169,7 @@ def _node(i: int, j: int) -> str:
 
 
 def _check_nodes(file: h5py.File, width: int, length: int) -> None:
-    """Before anything as large as a wrong size says is allocated."""
+    """Checks the nodes, before anything as large as a wrong size says is allocated."""
     for group in ("Steps/Position", "Steps/Velocity"):
         present = file.get(group, ())
         for j in range(length):
@@ -179,7 +179,7 @@ def _check_nodes(file: h5py.File, width: int, length: int) -> None:
 
 
 def _frames(file: h5py.File, width: int, length: int) -> dict[str, np.ndarray]:
-    """Every array of the state [frames, nodes, 3 or 2], the nodes in our order."""
+    """Reads every array of the state [frames, nodes, 3 or 2], the nodes in our order."""
     names = [_node(i, j) for j in range(length) for i in range(width)]
     frames = len(np.atleast_1d(_dataset(file, f"Steps/Position/{names[0]}/LPOS")))
     if frames < 2:

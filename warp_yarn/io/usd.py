@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError, number, whole
+from ..errors import InputError, integer, real
 from ..simulation.state import Trajectory
 from ..view.geometry import Strands, Tubes, strands
-from .files import whole_file
+from .files import atomic_write
 
 if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
     from pxr import UsdGeom
@@ -53,12 +53,12 @@ def write_usd(
         InputError: an argument is out of its range, or the folder of `path` does not exist.
         OSError: the file cannot be written, such as to a full disk.
     """
-    slowdown = number("slowdown", slowdown, above=0.0)
-    sides = whole("sides", sides, least=3)
+    slowdown = real("slowdown", slowdown, above=0.0)
+    sides = integer("sides", sides, least=3)
     if Path(path).suffix not in ENDINGS:
         raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
     parts = strands(trajectory)
-    with whole_file(path) as temporary, writing(path):
+    with atomic_write(path) as temporary, writing(path):
         # a function of its own, so that no stage holds the file when it is moved: Windows would not move it
         _write_stage(temporary, trajectory, parts, tubes=tubes, rate=1.0 / (trajectory.step * slowdown), sides=sides)
     reload(path)
@@ -120,8 +120,8 @@ def _write_stage(
 
 
 def origins(trajectory: Trajectory) -> np.ndarray:
-    """Where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would move
-    them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
+    """Finds where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would
+    move them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
     position = trajectory.position
     low, high = position.min(axis=1), position.max(axis=1)
     reach = COARSE * trajectory.cloth.radius / np.finfo(np.float32).epsneg
@@ -160,7 +160,7 @@ def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndar
 
 
 def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
-    """displayColor is linear; the colours of yarns are those of a screen (sRGB)."""
+    """Writes a yarn's colour, which is that of a screen (sRGB), as displayColor, which is linear."""
     from pxr import Gf, UsdGeom
 
     color = np.array(part.color, dtype=np.float64)

@@ -37,7 +37,7 @@ WIND = (0.0, 5.0, 0.0)
 def cloth(
     weave: str = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
 ) -> Cloth:
-    """A cloth of two of the paper's yarns, upright.
+    """Makes a cloth of two of the paper's yarns, upright.
 
     Args:
         weave: "plain", "twill" or "satin".
@@ -56,7 +56,7 @@ def cloth(
 
 
 def hung(cloth: Cloth, **options: Any) -> Scene:
-    """The paper's scene: the cloth hangs by its two top corners in a wind along +y.
+    """Makes the paper's scene: the cloth hangs by its two top corners in a wind along +y.
 
     Args:
         options: of the Scene, to change it: ``wind``, ``sliding``, ``pin_stiffness``, ...
@@ -67,5 +67,5 @@ def hung(cloth: Cloth, **options: Any) -> Scene:
 def hung_cloth(
     weave: str = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
 ) -> Scene:
-    """``hung(cloth(...), **options)``, all in one call."""
+    """Makes ``hung(cloth(...), **options)``, all in one call."""
     return hung(cloth(weave, rows, columns, yarns), **options)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..description.scene import Scene
-from ..errors import InputError, SimulationError, number, whole
+from ..errors import InputError, SimulationError, integer, real
 from ..kernels import TERMS
 from .simulator import Simulator
 from .state import State
@@ -17,8 +17,8 @@ from .state import State
 DEARER = -0.1
 """Costs below this are worth a word: the solver needs the term more than the cloth does."""
 
-SLOW = 5.0
-"""Runs that take so many times as long are timed once."""
+TIMED_ONCE = 5.0
+"""Times as long as the whole scene's: runs from there on are timed once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Ablation:
     together: Change | None
 
     def lines(self) -> list[str]:
-        """What was found, in words."""
+        """Says what was found, in words."""
         found = [str(change) for change in self.changes]
         found.append(f"half the step moves the cloth by {percent(self.step_error)}")
         if not self.unneeded:
@@ -96,7 +96,7 @@ class Ablation:
 
 
 def percent(fraction: float) -> str:
-    """In percent, with two digits."""
+    """Writes a fraction in percent, with two digits."""
     return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
@@ -118,8 +118,8 @@ def ablate(
         InputError: an argument that cannot be used, or a cloth that does not move.
         SimulationError: the whole scene cannot be simulated. Another one that cannot is a Change with a failure.
     """
-    steps, repeats = whole("steps", steps, least=1), whole("repeats", repeats, least=1)
-    step = number("step", step, above=0.0)
+    steps, repeats = integer("steps", steps, least=1), integer("repeats", repeats, least=1)
+    step = real("step", step, above=0.0)
 
     def run(scene: Scene, fine: int = 1) -> _Run:
         return _Run(scene, fine * steps, step / fine, start, options)
@@ -163,7 +163,7 @@ class _Run:
         self.seconds: list[float] = []
 
     def make(self) -> float:
-        """One run from the beginning; its wall time [s]."""
+        """Makes one run from the beginning, and gives its wall time [s]."""
         self.simulator.state, self.simulator.steps_done = self.start, 0
         begin = time.perf_counter()
         self.position = self.simulator.run(self.steps).position
@@ -174,7 +174,7 @@ class _Run:
 
 
 def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> list[Change]:
-    """The runs beside that of the whole scene, timed in turn with it."""
+    """Compares runs with that of the whole scene, timed in turn with it."""
     failures = {}
     for name, run in runs.items():
         try:
@@ -188,7 +188,7 @@ def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> 
         full.seconds.append(whole_time)
         for name, run in made.items():
             # what takes that much longer needs no second look
-            if not ratios[name] or ratios[name][0] < SLOW:
+            if not ratios[name] or ratios[name][0] < TIMED_ONCE:
                 ratios[name].append(run.make() / whole_time)
     changes = []
     for name, run in runs.items():
@@ -201,14 +201,14 @@ def _compared(full: _Run, moved: float, repeats: int, runs: dict[str, _Run]) -> 
 
 
 def _without(scene: Scene, names: set[str]) -> Scene:
-    """The scene without these terms, or sliding."""
+    """Makes the scene without these terms, or sliding."""
     sliding = scene.sliding and "sliding" not in names
     left = (name for name in scene.terms if name not in names)
     return scene.replace(sliding=sliding, terms=[name for name in left if sliding or not TERMS[name].sliding_only])
 
 
 def _halved(scene: Scene, start: State | None) -> Scene:
-    """The scene for half the step: pins go evenly to where they are at a step's end, and forces stay for two."""
+    """Makes the scene for half the step: pins go evenly to where they are at a step's end, and forces stay for two."""
     path = scene.pin_path
     if path is not None:
         first = (scene.cloth if start is None else start).position[scene.pins]

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 
 from ..device.model import MATRIX, Model
+from ..moved import renamed
 
 
 @dataclasses.dataclass(frozen=True)
-class System:
+class LinearSystem:
     """A symmetric linear system: entries of its matrix, right-hand side, and which unknowns are free to move.
 
     Unknown 3 i + k is velocity k of node i; behind them, with sliding, unknown 3 nodes + 2 i + d its rate along d.
@@ -21,14 +22,14 @@ class System:
     free: np.ndarray
 
     def dense(self) -> np.ndarray:
-        """The matrix, as a dense array."""
+        """Makes a dense array of the matrix."""
         result = np.zeros((len(self.rhs), len(self.rhs)))
         np.add.at(result, (self.rows, self.columns), self.entries)
         return result
 
 
-def gather(model: Model) -> System:
-    """The system that a model has assembled; the layout of its blocks is told in ``kernels/linear/block_matrix.py``."""
+def read_system(model: Model) -> LinearSystem:
+    """Reads the system that a model has assembled; ``kernels/linear/block_matrix.py`` tells how its blocks lie."""
     a, nodes, stencil = model.arrays, model.scene.cloth.nodes, model.arrays.stencil
     values = {name: a[name].numpy() for name in (*MATRIX, "rhs", "euler_rhs") if a[name] is not None}
     x = np.arange(3 * nodes).reshape(nodes, 3)
@@ -67,10 +68,13 @@ def gather(model: Model) -> System:
     if model.scene.sliding:
         free.append(np.repeat(topology.is_crossing != 0, 2))
         rhs.append(values["euler_rhs"])
-    return System(
+    return LinearSystem(
         np.concatenate(rows),
         np.concatenate(columns),
         np.concatenate(entries),
         np.concatenate(rhs),
         np.concatenate(free),
     )
+
+
+__getattr__ = renamed(__name__, {"System": "LinearSystem", "gather": "read_system"})

@@ -12,8 +12,8 @@ import numpy as np
 from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
-from ..errors import InputError, finite_array, number, whole
-from ..io.files import whole_file
+from ..errors import InputError, finite_array, integer, real
+from ..io.files import atomic_write
 
 FORMAT = 2
 """Of recordings: 1 had no number, no scene and no count of steps."""
@@ -38,7 +38,7 @@ class State:
     anchor: np.ndarray | None = None
 
     def __eq__(self, other: object) -> bool:
-        """Whether two are the same, to the last bit."""
+        """Tells whether two are the same, to the last bit."""
         if not isinstance(other, State):
             return NotImplemented
         pairs = [(getattr(self, name), getattr(other, name)) for name in FIELDS[:-1]]
@@ -46,7 +46,8 @@ class State:
         return all(np.array_equal(a, b) for a, b in [*pairs, tuple(anchors)])
 
     def checked(self, nodes: int) -> State:
-        """A copy with every array finite and of the right shape, and Δs > 0 left to the simulator; or an InputError."""
+        """Copies it, with every array finite and of the right shape; an InputError says what is not. Δs > 0 is left to
+        the simulator."""
         euler = finite_array("state.euler", self.euler, (nodes, 2))
         return State(
             finite_array("state.position", self.position, (nodes, 3)),
@@ -89,7 +90,7 @@ class Trajectory:
         return self.start + len(self) - 1
 
     def __eq__(self, other: object) -> bool:
-        """Whether two have the same frames of the same cloth, to the last bit."""
+        """Tells whether two have the same frames of the same cloth, to the last bit."""
         if not isinstance(other, Trajectory):
             return NotImplemented
         if not self.cloth.same_as(other.cloth) or (self.step, self.start) != (other.step, other.start):
@@ -100,7 +101,7 @@ class Trajectory:
         return len(self.position)
 
     def __getitem__(self, frame: int) -> State:
-        """One frame, as a State; negative frames count from the end."""
+        """Copies one frame, as a State; negative frames count from the end."""
         return State(*(getattr(self, name)[frame].copy() for name in FIELDS))
 
     @property
@@ -109,12 +110,12 @@ class Trajectory:
         return np.arange(len(self)) * self.step
 
     def cut(self, frames: int) -> Trajectory:
-        """The first frames of it."""
+        """Takes the first frames of it."""
         parts: dict[str, Any] = {name: getattr(self, name)[:frames] for name in FIELDS}
         return dataclasses.replace(self, **parts)
 
     def joined(self, later: Trajectory) -> Trajectory:
-        """This and a run that went on from its last frame.
+        """Joins this and a run that went on from its last frame.
 
         Raises:
             InputError: it did not: its cloth, scene, step, steps before it or first frame (beyond what single precision
@@ -148,7 +149,7 @@ class Trajectory:
         yarns = np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns])
         colors = np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns])
         numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
-        with whole_file(path) as temporary, open(temporary, "wb") as file:
+        with atomic_write(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
                 format=FORMAT,
@@ -171,7 +172,7 @@ class Trajectory:
         """Reads what ``save`` wrote; an InputError says what is wrong with the file."""
         try:
             with np.load(path) as data:
-                written = whole("format", data["format"].item(), least=1) if "format" in data else 1
+                written = integer("format", data["format"].item(), least=1) if "format" in data else 1
                 if written > FORMAT:
                     raise InputError(f"format = {written}, this warp_yarn reads up to {FORMAT}: it needs a newer one")
                 yarns = [
@@ -194,10 +195,10 @@ class Trajectory:
                 }
                 return cls(
                     cloth,
-                    number("step", data["step"].item(), above=0.0),
+                    real("step", data["step"].item(), above=0.0),
                     **values,
                     scene=_unpacked(cloth, data) if "scene_terms" in data else None,
-                    start=whole("start", data["start"].item(), least=0) if "start" in data else 0,
+                    start=integer("start", data["start"].item(), least=0) if "start" in data else 0,
                 )
         except FileNotFoundError as error:
             raise InputError(f"{Path(path)}: there is no such file") from error
@@ -208,7 +209,7 @@ class Trajectory:
 
 
 def _packed(scene: Scene) -> dict[str, Any]:
-    """A scene as arrays; what is None is left out."""
+    """Packs a scene into arrays; what is None is left out."""
     wind = scene.wind
     values = {
         "terms": np.array(scene.terms),
@@ -228,7 +229,7 @@ def _packed(scene: Scene) -> dict[str, Any]:
 
 
 def _unpacked(cloth: Cloth, data: Any) -> Scene:
-    """The scene that ``_packed`` made arrays of."""
+    """Makes the scene that ``_packed`` made arrays of."""
 
     def value(name: str) -> Any:
         return data.get(f"scene_{name}")

@@ -14,6 +14,7 @@ from ..device.exclusive import ALONE
 from ..device.graphs import GraphCache
 from ..device.model import Model
 from ..kernels.core.status import GAINED, INACCURATE
+from ..moved import renamed, renamed_attribute
 
 SMALLEST = 2.0**-7
 """Of a step, where a part is halved because it cannot be made."""
@@ -26,19 +27,19 @@ MOST_SHRINKAGE = 0.2
 """From a part to the next: the error need not be of third order in it."""
 
 
-class Parts:
+class Substepping:
     """Makes a step in parts: each half of one that could not be made, or as large as its error allows.
 
     Args:
         model: with the state that a step starts from.
         method: the integrator, one with an error estimate where ``allowed`` is given.
-        allowed: error of a part, as of ``error`` [m]; None: any.
+        allowed: error of a part, which ``error`` estimates [m]; None: any.
         fallback: makes the method for parts that gain energy; None: there is none.
 
     Attributes:
-        size: of the next part, in steps; it follows the error from step to step.
-        tried: size of the last part.
-        made, rejected: parts made since the beginning, and those that were not good enough or could not be made.
+        next_size: of the next part, in steps; it follows the error from step to step.
+        last_size: of the last part, in steps.
+        accepted, rejected: parts made since the beginning, and those that were not good enough or could not be made.
         damped: parts that the fallback made.
         watcher: called after every part that was made, with the method, the part's size and what was left of the step
             before it, in steps. The state is at its end then, and ``kept_position`` and so on are its start.
@@ -54,8 +55,17 @@ class Parts:
 
     def reset(self) -> None:
         """Begins anew, as for another motion."""
-        self.size = self.tried = 1.0
-        self.made = self.rejected = self.damped = 0
+        self.next_size = self.last_size = 1.0
+        self.accepted = self.rejected = self.damped = 0
+
+    @property
+    def counts(self) -> tuple[float, int, int, int]:
+        """What a step in parts changes: next_size, accepted, rejected and damped."""
+        return self.next_size, self.accepted, self.rejected, self.damped
+
+    @counts.setter
+    def counts(self, counts: tuple[float, int, int, int]) -> None:
+        self.next_size, self.accepted, self.rejected, self.damped = counts
 
     def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
@@ -74,8 +84,8 @@ class Parts:
         while done < 1.0:
             left = 1.0 - done
             # as many of one size as fit; rounding is not to add another
-            parts = max(1, math.ceil(left / self.size - 1e-9))
-            size = self.tried = left / parts
+            parts = max(1, math.ceil(left / self.next_size - 1e-9))
+            size = self.last_size = left / parts
             self._copy("kept_", "")
             method, accepted = self.method, not gained and self._try(self.method, count, size, left)
             if not accepted and self._is_to_damp(gained, least):
@@ -85,35 +95,36 @@ class Parts:
                 method = self._fallback
             if not accepted:
                 self.rejected += 1
-                if self.size < least:
+                if self.next_size < least:
                     return 0.0
                 self._restore()
                 continue
+            self.accepted += 1
             if self.watcher is not None:
                 self.watcher(method, size, left)
-            self.made += 1
             smallest = min(smallest, size)
             done = 1.0 if parts == 1 else done + size
         return smallest
 
     def _try(self, method: Any, count: Callable[[], None], size: float, left: float) -> bool:
-        """Makes a part; whether it is good."""
+        """Makes a part, and says whether it is good."""
         count()
         method.set_times(size * self.model.step_size, left * self.model.step_size)
         method.advance()
         if method is self.method:
             return self._accepts(size)
-        self.size = size if self._status() == 0 else 0.5 * size
+        self.next_size = size if self._status() == 0 else 0.5 * size
         return self._status() == 0
 
     def _is_to_damp(self, gained: bool, least: float) -> bool:
-        """Whether the fallback is to make the part: it gains energy, or could not be made and is the smallest."""
+        """Tells whether the fallback is to make the part: it gains energy, or could not be made and is the smallest."""
         if not self.can_damp or self._status() == INACCURATE:
             return False
-        return gained or self._status() == GAINED or self.size < least
+        return gained or self._status() == GAINED or self.next_size < least
 
     def _damp(self, count: Callable[[], None], size: float, left: float, *, last: bool) -> bool:
-        """Makes a part by the fallback; whether it is good. The last resort, which cannot be halved, may gain more."""
+        """Makes a part by the fallback, and says whether it is good. The last resort, which cannot be halved, may gain
+        more."""
         if self._fallback is None:
             with ALONE:
                 self._fallback = self._make_fallback()
@@ -139,25 +150,25 @@ class Parts:
         self.model.arrays.put("audit_due", 1)
 
     def _accepts(self, size: float) -> bool:
-        """Whether the part is good; says what size the next is to have."""
+        """Tells whether the part is good, and sets the size that the next is to have."""
         if self._status():
-            self.size = 0.5 * size
+            self.next_size = 0.5 * size
             return False
         if self.allowed is None:
             return True
         ratio = self.error() / self.allowed
         factor = MOST_GROWTH if ratio == 0.0 else SAFETY * ratio ** (-1.0 / (self.method.order + 1))
-        self.size = size * min(MOST_GROWTH, max(MOST_SHRINKAGE, factor))
+        self.next_size = size * min(MOST_GROWTH, max(MOST_SHRINKAGE, factor))
         if ratio > 1.0:
             self.model.arrays.put("status", INACCURATE, -1, 0)
         return ratio <= 1.0
 
     def error(self) -> float:
-        """Estimated error of the last part: how far the node is off that is farthest off [m]."""
+        """Estimates the error of the last part: how far the node is off that is farthest off [m]."""
         return float(self.model.arrays["step_error"].numpy()[0])
 
     def _copy(self, target: str, source: str) -> None:
-        """The state, put by or brought back."""
+        """Puts the state by, or brings it back."""
         model, a = self.model, self.model.arrays
         moving = [name for name in (*STATE_TYPES, "bounds") if a[name] is not None]
         for name in moving:
@@ -165,3 +176,10 @@ class Parts:
                 with ALONE:
                     a[f"kept_{name}"] = a.zeros(a[name].shape[0], a[name].dtype)
         self._graphs.run(target, lambda: model.copy(**{target + name: source + name for name in moving}))
+
+    size = renamed_attribute("size", "next_size")
+    tried = renamed_attribute("tried", "last_size")
+    made = renamed_attribute("made", "accepted")
+
+
+__getattr__ = renamed(__name__, {"Parts": "Substepping"})

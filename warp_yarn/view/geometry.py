@@ -46,7 +46,7 @@ class Strands:
         return np.concatenate([np.pad(yarn, 1, mode="edge") for yarn in yarns])
 
     def sampled(self, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points on the curves, `samples` a segment and the last end.
+        """Finds points on the curves, `samples` a segment and the last end.
 
         Returns:
             The number of points of each yarn [yarns], the points [frames, sum, 3] (m), unit tangents there.
@@ -84,7 +84,7 @@ class Tubes:
 
     @classmethod
     def around(cls, strands: Strands, radius: float, *, sides: int, samples: int) -> Tubes:
-        """Tubes with `samples` rings a segment; rings do not twist, along the yarn or from frame to frame."""
+        """Makes tubes with `samples` rings a segment; rings do not twist, along the yarn or from frame to frame."""
         counts, centres, tangents = strands.sampled(samples)
         start = counts.cumsum() - counts
         first = np.empty_like(tangents)
@@ -101,16 +101,16 @@ class Tubes:
         return cls(centres, np.stack([first, np.cross(tangents, first)], axis=2), counts, radius, sides)
 
     def normals(self, frame: int) -> np.ndarray:
-        """Unit vectors out of the yarn at every vertex of one frame [rings · sides, 3], ring after ring."""
+        """Finds unit vectors out of the yarn at every vertex of one frame [rings · sides, 3], ring after ring."""
         angle = 2.0 * np.pi * np.arange(self.sides) / self.sides
         return (np.stack([np.cos(angle), np.sin(angle)], axis=1) @ self.across[frame]).reshape(-1, 3)
 
     def vertices(self, frame: int) -> np.ndarray:
-        """Vertices of one frame [rings · sides, 3] (m)."""
+        """Finds the vertices of one frame [rings · sides, 3] (m)."""
         return np.repeat(self.centres[frame], self.sides, axis=0) + self.radius * self.normals(frame)
 
     def faces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Number of corners of each face, and the vertices at them, counter-clockwise seen from outside."""
+        """Lists the number of corners of each face, and the vertices at them, counter-clockwise seen from outside."""
         side = np.arange(self.sides)
         end = self.counts.cumsum()
         ring = np.delete(np.arange(end[-1]), end - 1)[:, None] * self.sides
@@ -124,7 +124,7 @@ class Tubes:
 
 
 def strands(trajectory: Trajectory) -> list[Strands]:
-    """The yarns of every material that the cloth uses, at every frame."""
+    """Lists the yarns of every material that the cloth uses, at every frame."""
     position = checked(trajectory)
     cloth, topology = trajectory.cloth, trajectory.cloth.topology
     offset = cloth.radius * contact_normals(cloth, position)
@@ -144,7 +144,7 @@ def strands(trajectory: Trajectory) -> list[Strands]:
 
 
 def checked(trajectory: Trajectory) -> np.ndarray:
-    """Positions of a trajectory that can be drawn [frames, nodes, 3] (m), or an InputError."""
+    """Gives the positions of a trajectory that can be drawn [frames, nodes, 3] (m), or an InputError."""
     if not isinstance(trajectory, Trajectory):
         raise InputError(f"trajectory = {trajectory!r}, must be a Trajectory, such as Simulator.run returns")
     position = finite_array("trajectory.position", trajectory.position, (None, trajectory.cloth.nodes, 3))
@@ -154,7 +154,7 @@ def checked(trajectory: Trajectory) -> np.ndarray:
 
 
 def contact_normals(cloth: Cloth, position: np.ndarray) -> np.ndarray:
-    """Unit normal from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
+    """Computes unit normals from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
     topology, device = cloth.topology, wp.get_device("cpu")
     with ALONE, compiling():
         refuse_recording(device)
@@ -171,12 +171,12 @@ def contact_normals(cloth: Cloth, position: np.ndarray) -> np.ndarray:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Where a yarn has shrunk to a point it has no direction; 0 there keeps its tube finite."""
+    """Scales to length 1. Where a yarn has shrunk to a point it has no direction; 0 there keeps its tube finite."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
 
 
 def _transported(vectors: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Unit vectors at right angles to `before`, by the smallest rotation that takes `before` to `after`."""
+    """Carries unit vectors at right angles to `before`, by the smallest rotation that takes `before` to `after`."""
     along = (vectors * after).sum(axis=-1, keepdims=True)
     fold = 1.0 + (before * after).sum(axis=-1, keepdims=True)
     moved = vectors - (before + after) * (along / np.maximum(fold, 1e-12))

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from ..errors import InputError, finite_array, number, whole
-from ..io.files import whole_file
+from ..errors import InputError, finite_array, integer, real
+from ..io.files import atomic_write
 from ..simulation.state import Trajectory
 from .geometry import Tubes, checked, strands
 
@@ -67,7 +67,7 @@ def write_png(
     if not isinstance(frame, int | np.integer) or not -frames <= frame < frames:
         raise InputError(f"frame = {frame!r}, must be a whole number from {-frames} to {frames - 1}")
     shown = dataclasses.replace(trajectory, position=position[[frame]])
-    with whole_file(path) as temporary, _Picture(shown, size, view) as picture:
+    with atomic_write(path) as temporary, _Picture(shown, size, view) as picture:
         picture.drawn(0, temporary)
 
 
@@ -100,15 +100,15 @@ def write_mp4(
             installed, or the machine has no OpenGL.
     """
     _check_ending(path, ".mp4")
-    rate = number("frames_per_second", frames_per_second, above=0.0)
-    apart = 1.0 / (rate * number("slowdown", slowdown, above=0.0))
+    rate = real("frames_per_second", frames_per_second, above=0.0)
+    apart = 1.0 / (rate * real("slowdown", slowdown, above=0.0))
     size = _checked_size(size)
     if size[0] % 2 or size[1] % 2:
         raise InputError(f"size = {size}, must be even in a movie")
     imageio = _extra("imageio.v2")
     _extra("imageio_ffmpeg")
     movie = dataclasses.replace(trajectory, position=_resampled(checked(trajectory), apart / trajectory.step))
-    with whole_file(path) as temporary, _Picture(movie, size, view) as picture:
+    with atomic_write(path) as temporary, _Picture(movie, size, view) as picture:
         # Blocks of 2, since H.264 needs even sizes only and imageio would scale to multiples of 16.
         writer = imageio.get_writer(temporary, fps=rate, codec="libx264", quality=8, macro_block_size=2)
         with writer:
@@ -166,7 +166,7 @@ class _Picture:
         self.plotter.close()
 
     def drawn(self, frame: int, path: Path | None = None) -> np.ndarray:
-        """One frame as an image [height, width, 3], written to path if one is given."""
+        """Draws one frame as an image [height, width, 3], written to path if one is given."""
         for mesh, tubes in zip(self.meshes, self.tubes, strict=True):
             mesh.points = tubes.vertices(frame)
             mesh.point_data.active_normals = tubes.normals(frame)
@@ -202,12 +202,12 @@ class _Camera:
         return cls(axes, centre, distance, (max(distance - reach, 0.01 * distance), distance + reach))
 
     def world(self, place: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
-        """A place seen from the centre along the axes, in the cloth's coordinates."""
+        """Finds a place seen from the centre along the axes, in the cloth's coordinates."""
         return (self.centre + np.asarray(place)) @ self.axes
 
 
 def _resampled(position: np.ndarray, apart: float) -> np.ndarray:
-    """Positions at frames 0, apart, 2 apart, ... up to the last, in between them along straight lines."""
+    """Interpolates positions at frames 0, apart, 2 apart, ... up to the last, in between them along straight lines."""
     last = len(position) - 1
     # Where a picture falls on the last frame, rounding must not lose it.
     at = np.arange(np.floor(last / apart + 1e-9) + 1.0) * apart
@@ -225,7 +225,7 @@ def _check_ending(path: str | os.PathLike, ending: str) -> None:
 def _checked_size(size: Sequence[int]) -> tuple[int, int]:
     if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
         raise InputError(f"size = {size!r}, must be a width and a height in pixels")
-    return whole("size[0]", size[0], least=16), whole("size[1]", size[1], least=16)
+    return integer("size[0]", size[0], least=16), integer("size[1]", size[1], least=16)
 
 
 def _extra(module: str) -> Any:
@@ -241,7 +241,7 @@ _LOADING = threading.Lock()
 
 
 def _pyvista() -> Any:
-    """PyVista, where VTK can draw; where it cannot, VTK would end the process by a segmentation fault."""
+    """Imports PyVista, where VTK can draw; where it cannot, VTK would end the process by a segmentation fault."""
     with _LOADING:
         pv = _loaded_pyvista()
         # it imports what draws when that is first asked for

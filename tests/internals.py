@@ -1,0 +1,141 @@
+"""What tests know of the insides of the package, and only this file does: when they change, it is mended here."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import warp as wp
+from warp_yarn.kernels.core.status import GAINED, STALLED
+
+import warp_yarn as wy
+from warp_yarn.device import exclusive
+from warp_yarn.simulation import ablation, checks
+from warp_yarn.view import render
+
+# -- a simulator's arrays ---------------------------------------------------------------------------------------------
+
+
+def numbers(simulator: wy.Simulator, name: str) -> np.ndarray | None:
+    """A copy of an array that kernels use; None where the scene has none."""
+    array = simulator.arrays[name]
+    return None if array is None else array.numpy().copy()
+
+
+def put(simulator: wy.Simulator, name: str, values: object) -> None:
+    """Writes into an array that kernels use; one number goes everywhere."""
+    array = simulator.arrays[name]
+    array.assign(np.broadcast_to(np.asarray(values), array.numpy().shape))
+
+
+def add_array(simulator: wy.Simulator, name: str, array: str | None) -> None:
+    """Gives a simulator another array: one of its own by its name, or a new one as it is declared."""
+    arrays = simulator.arrays
+    arrays[name] = arrays.new(name) if array is None else arrays[array]
+
+
+def array_arguments(simulator: wy.Simulator, kernel: str) -> set[str]:
+    """Names of the arrays that a kernel takes."""
+    found = simulator.model.kernels[kernel].adj.args
+    structs = [a.type for a in found if a.label in ("blocks", "work")]
+    fields = {name for struct in structs for name, field in struct.vars.items() if isinstance(field.type, wp.array)}
+    return {a.label for a in found if isinstance(a.type, wp.array)} | fields
+
+
+def strips(simulator: wy.Simulator) -> int:
+    """How many processor cores share a linear solve."""
+    return simulator.model.threads.count
+
+
+# -- steps ------------------------------------------------------------------------------------------------------------
+
+
+def newton_tolerance(simulator: wy.Simulator, step: float) -> float:
+    return simulator.model.newton_tolerance_at(step)
+
+
+def left_of_the_last_stage(simulator: wy.Simulator) -> float:
+    """What another step of Newton's iteration would change, relative to the tolerance."""
+    change = float(numbers(simulator, "change")[0])
+    simulator.integrator.newton.evaluate(matrix=True)
+    simulator.integrator.newton.solve_direction(1)
+    slope = float(numbers(simulator, "directional_derivative")[0])
+    return np.sqrt(slope) / change / newton_tolerance(simulator, simulator.step_size)
+
+
+def fails_at_first(simulator: wy.Simulator, largest: float) -> None:
+    """Makes a simulator fail in its first step, wherever it tries more of it at once than so much [s]."""
+    advance, arrays = simulator.integrator.advance, simulator.arrays
+
+    def attempt() -> None:
+        if arrays["counters"].numpy()[1] == 0 and arrays["step_size"].numpy()[0] > largest:
+            arrays["status"].assign(np.array([STALLED, -1, 0], dtype=np.int32))
+        advance()
+
+    simulator.integrator.advance = attempt
+
+
+def force_a_gain(simulator: wy.Simulator) -> list[int]:
+    """Says once of a whole step, in Python, that it gained energy."""
+    advance, said = simulator.stepper._advance, []
+
+    def gained(steps: int) -> int:
+        if said:
+            return advance(steps)
+        said.append(1)
+        put(simulator, "status", [GAINED, -1, 1])
+        return 0
+
+    simulator.stepper._advance = gained
+    return said
+
+
+def errors_of_accepted_parts(simulator: wy.Simulator) -> list[float]:
+    """A list that fills with the error [m] of every part of a step that is accepted from now on."""
+    substepping, errors = simulator.substepping, []
+    accepts = substepping._accepts
+
+    def looked_at(size: float) -> bool:
+        good = accepts(size)
+        if good:
+            errors.append(substepping.error())
+        return good
+
+    substepping._accepts = looked_at
+    return errors
+
+
+def a_step_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets simulators that are made from now on keep one step on the device."""
+    monkeypatch.setattr(checks, "CHUNK_BYTES", 0)
+
+
+# -- locks ------------------------------------------------------------------------------------------------------------
+
+
+def locks_taken() -> list[object]:
+    """Locks that no other thread can take."""
+    taken = []
+
+    def take() -> None:
+        for lock in (exclusive.ALONE, exclusive._registering, *exclusive._replaying):
+            if lock.acquire(timeout=2.0):
+                lock.release()
+            else:
+                taken.append(lock)
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    thread.join()
+    return taken
+
+
+# -- parts of public functions that are worth a test of their own -----------------------------------------------------
+
+halved: Callable = ablation._halved
+unneeded: Callable = ablation._unneeded
+resampled: Callable = render._resampled
+pyvista: Callable = render._pyvista
+Camera, Picture = render._Camera, render._Picture

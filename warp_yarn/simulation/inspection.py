@@ -1,0 +1,135 @@
+"""What one may look into: forces, contact, energies and the linear system of any state of a simulator's scene."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from ..device.model import Model
+from ..errors import InputError
+from .alone import alone
+from .checks import checked_state
+from .linear_system import LinearSystem, read_system
+from .state import FIELDS, State
+from .stepper import Stepper
+
+
+class Inspection:
+    """Looks into the present state or another one, and leaves no trace. The base of the simulator, which has these:
+
+    Attributes:
+        model: the scene on the device.
+        stepper: makes its steps.
+        lock: held while one thread uses it.
+    """
+
+    model: Model
+    stepper: Stepper
+    lock: threading.RLock
+
+    @alone
+    def forces(self, state: State | None = None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Computes the force of every term of the scene on a state (None: the present one), by name.
+
+        Returns:
+            {term: (x_forces [nodes, 3] in N, s_forces [nodes, 2] in N)}.
+        """
+        a, cloth, result = self.model.arrays, self.model.scene.cloth, {}
+        crossing = np.repeat(cloth.topology.is_crossing != 0, 2)
+        with _Visit(self.stepper, state):
+            self.model.add_contact_load()
+            total = np.zeros(2 * cloth.nodes)
+            for term in a.terms:
+                if term.name == "mass":
+                    continue
+                a.zero("force", "euler_force", "friction_force_out")
+                if term.reads_forces:
+                    a["euler_force"].assign(total)
+                self.model.launch_term(term, matrix=0, add_contact_load=0)
+                out = "friction_force_out" if term.name == "friction" else "euler_force"
+                along = np.zeros(2 * cloth.nodes)
+                if a[out] is not None:
+                    # the border has no Eulerian coordinate: what a segment puts there moves nothing
+                    along = np.where(crossing, a[out].numpy(), 0.0)
+                total += along
+                result[term.name] = (a["force"].numpy().astype(np.float64), along.reshape(cloth.nodes, 2).copy())
+        return result
+
+    @alone
+    def contact(self, state: State | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Computes contact normals, from warp to weft [nodes, 3], and contact forces F_n [nodes] (N), eq. 3; both are 0
+        on the border.
+
+        Raises:
+            InputError: the scene has no contact.
+        """
+        a = self.model.arrays
+        if not a.contact:
+            raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
+        with _Visit(self.stepper, state):
+            self.model.add_contact_load()
+            load = a["contact_load"].numpy().astype(np.float64)
+            return a["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
+
+    @alone
+    def energy(self, state: State | None = None) -> dict[str, float]:
+        """Computes the energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
+        a, result = self.model.arrays, {}
+        with _Visit(self.stepper, state):
+            self.model.add_contact_load()
+            energy = a.zeros(1, a.variant.scalar)
+            for term in a.terms:
+                if term.energy is not None:
+                    energy.zero_()
+                    self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
+                    result[term.name] = float(energy.numpy()[0])
+        return result
+
+    @alone
+    def system(self, state: State | None = None, weights: tuple[float, float, float] | None = None) -> LinearSystem:
+        """Assembles the linear system of the next step of eq. 2, to look into.
+
+        Args:
+            state: of the step's beginning; None: the present one.
+            weights: factors of M, D and H in its matrix; None: 1, h and h².
+        """
+        h = self.model.step_size
+        with _Visit(self.stepper, state, ahead=True):
+            self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
+            self.model.assemble()
+            return read_system(self.model)
+
+
+class _Visit:
+    """Another state for as long as a block lasts; the arrays that a step works with are free for it.
+
+    Pins and applied forces are those of the last step, or, if asked for, of the next one.
+    """
+
+    def __init__(self, stepper: Stepper, state: State | None, *, ahead: bool = False):
+        self.stepper = stepper
+        self.ahead = ahead
+        self.row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.visited = None if state is None else checked_state(state, stepper.model.scene)
+
+    def __enter__(self) -> None:
+        stepper, model, home = self.stepper, self.stepper.model, {}
+        if self.visited is not None:
+            home = {name: model.arrays[name].numpy().copy() for name in FIELDS if stepper.frames.moves(name)}
+
+        def go_home() -> None:
+            for name, value in home.items():
+                model.arrays[name].assign(value)
+            stepper.integrator.set_times(model.step_size, model.step_size)
+
+        stepper.owe(go_home)
+        model.arrays.put("counters", 0, self.row)
+        # before the first step, pins are where they start
+        model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
+        model.inputs.load()
+        if self.visited is not None:
+            stepper.frames.upload(self.visited)
+
+    def __exit__(self, *_: object) -> None:
+        self.stepper.pay()
