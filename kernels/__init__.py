@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from .contact import limits, obstacles
 from .core.variant import Term, Variant
 from .linear import block_matrix, conjugate_gradient, incomplete_cholesky, multilevel
 from .nonlinear import newton
@@ -40,6 +41,7 @@ _REGISTERED = (
     wind.TERM,
     pins.TERM,
     applied_force.TERM,
+    obstacles.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
 TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
@@ -62,6 +64,7 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
+    kernels |= vars(limits.define_motion(variant)) | vars(obstacles.define_reports(variant.forward))
     for part in (
         linear,
         block_matrix,
@@ -69,6 +72,7 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
         conjugate_gradient,
         multilevel,
         newton,
+        limits,
         energy_watch,
         frames,
         linear_adjoint,

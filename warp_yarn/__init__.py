@@ -6,6 +6,7 @@ from types import ModuleType
 
 from . import moved
 from .description.cloth import Cloth, Yarn
+from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
@@ -22,15 +23,22 @@ __version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
     "WEAVES",
+    "Box",
+    "Capsule",
     "Cloth",
+    "Contact",
+    "Cylinder",
     "GradientError",
     "InputError",
+    "Plane",
     "Published",
     "Scene",
     "SimulationError",
     "Simulator",
+    "Sphere",
     "State",
     "Trajectory",
+    "TriangleMesh",
     "WarpYarnError",
     "Weave",
     "Wind",

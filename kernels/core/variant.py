@@ -29,6 +29,10 @@ class Variant:
         return wp.types.vector(3, self.scalar)
 
     @property
+    def quat(self) -> type:
+        return {wp.float64: wp.quatd, wp.float32: wp.quatf}[self.scalar]
+
+    @property
     def mat33(self) -> type:
         return wp.types.matrix((3, 3), self.scalar)
 
@@ -76,6 +80,8 @@ class Term:
     next as well, 6 the diagonal ones as well."""
     needs_contact: bool = False
     """Whether the term reads the contact force of every crossing."""
+    touches: bool = False
+    """Whether the term is contact, whose energies are told together."""
     sliding_only: bool = False
     """Whether the term vanishes identically where yarns do not slide."""
     presses: bool = False

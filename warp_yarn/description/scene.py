@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError, choice, finite_array, indices, number
 from ..kernels import TERMS
 from .cloth import Cloth, Fixed
+from .obstacles import Contact, Obstacle
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,6 +55,8 @@ class Scene(Fixed):
             and friction, parallel yarns, inertia and mass rate have no part.
         terms: the terms to model, by name; None: all that the scene has a use for. ``mass`` is always there.
         published_scaling: take the arguments of eq. 4's tanh in SI units, as published, instead of dimensionless.
+        obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
+        contact: the law of contact; None: as ``Contact()``.
     """
 
     def __init__(
@@ -69,6 +72,8 @@ class Scene(Fixed):
         sliding: bool = True,
         terms: Sequence[str] | None = None,
         published_scaling: bool = False,
+        obstacles: Sequence[Obstacle] = (),
+        contact: Contact | None = None,
     ):
         if not isinstance(cloth, Cloth):
             raise InputError(f"cloth = {cloth!r}, must be a Cloth")
@@ -87,6 +92,12 @@ class Scene(Fixed):
         self.force_path = self._force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
+        if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
+            raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
+        self.obstacles = tuple(obstacles)
+        if contact is not None and not isinstance(contact, Contact):
+            raise InputError(f"contact = {contact!r}, must be a Contact or None")
+        self.contact = Contact() if contact is None else contact
         self.terms = self._terms(terms)
         self._fix(
             cloth=cloth,
@@ -99,6 +110,8 @@ class Scene(Fixed):
             sliding=self.sliding,
             terms=None if terms is None else self.terms,
             published_scaling=self.published_scaling,
+            obstacles=self.obstacles,
+            contact=contact,
         )
 
     def __repr__(self) -> str:
@@ -121,9 +134,11 @@ class Scene(Fixed):
             arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
             return [missing if array is None else array for array in arrays]
 
-        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling")
+        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling", "contact")
         return (
             self.cloth.same_as(other.cloth)
+            and len(self.obstacles) == len(other.obstacles)
+            and all(mine.same_as(its) for mine, its in zip(self.obstacles, other.obstacles, strict=True))
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
@@ -167,6 +182,8 @@ class Scene(Fixed):
             missing["wind"] = "wind is None"
         if not len(self.pins) or self.pin_stiffness is None:
             missing["pins"] = "there is no pin with a stiffness"
+        if not self.obstacles:
+            missing["obstacles"] = "there is none"
         if not len(self.force_nodes):
             missing["applied"] = "forces is empty"
         if names is None:

@@ -11,8 +11,11 @@ import warp as wp
 
 from ..description.cloth import Cloth
 from ..description.levels import BLOCKS, levels
+from ..description.obstacles import SPEED
 from ..description.scene import Scene
 from ..kernels import TERMS, Term, Variant, build
+from ..kernels.contact import barrier, distances
+from ..kernels.contact import obstacles as obstacle_contact
 from ..kernels.linear import multilevel
 from ..simulation.state import CLOTH_NUMBERS
 
@@ -43,6 +46,9 @@ class Arrays(dict[str, Any]):
         self._parameters(scene)
         self._state()
         self._work()
+        self._structs: dict[str, tuple[Any, Any]] = {}
+        if scene.obstacles:
+            self._obstacles(scene)
         self.dims = {
             "nodes": self["nodes"],
             "segments": len(self["segment_nodes"]),
@@ -51,6 +57,8 @@ class Arrays(dict[str, Any]):
             "triangles": len(self["triangle_nodes"]) if self["triangle_nodes"] is not None else 0,
             "pins": len(scene.pins),
             "applied": len(scene.force_nodes),
+            "obstacles": len(scene.obstacles),
+            "node_obstacles": len(scene.obstacles) * self["nodes"],
         }
 
     def zeros(self, count: int, dtype: Any) -> wp.array:
@@ -112,6 +120,86 @@ class Arrays(dict[str, Any]):
             if len(scene.force_path) > 1:
                 self["applied_force_path"] = self.numbers(scene.force_path.reshape(-1, 3))
         self["published_scaling"] = int(scene.published_scaling)
+
+    def _obstacles(self, scene: Scene) -> None:
+        cloth, contact, variant = scene.cloth, scene.contact, self.variant
+        mass = self.node_mass()
+        reach = contact.range or cloth.radius
+        self["contact_stiffness"] = self.numbers(contact.stiffness or mass * (SPEED / reach) ** 2)
+        self["contact_distance"] = self.numbers(contact.distance or cloth.radius)
+        self["contact_range"] = self.numbers(reach)
+        self["contact_slip_speed"] = self.numbers(contact.slip_speed)
+        self["contact_damping_speed"] = self.numbers(contact.damping_speed or np.inf)
+        several, quat = scene.obstacles, variant.quat
+        shapes = [getattr(distances, obstacle.shape.upper()) for obstacle in several]
+        self["obstacle_shape"] = wp.array(shapes, dtype=wp.int32, device=self.device)
+        self["obstacle_size"] = self.numbers([obstacle.size for obstacle in several])
+        self["obstacle_friction"] = self.numbers([obstacle.friction for obstacle in several])
+        pose = np.array([[*obstacle.position - self.origin, *obstacle.rotation] for obstacle in several])
+        steps = max((len(obstacle.path) for obstacle in several if obstacle.path is not None), default=0)
+        for place in ("", "_start", "_before") if steps else ("",):
+            self[f"obstacle_position{place}"] = self.numbers(pose[:, :3])
+            self[f"obstacle_rotation{place}"] = self.quaternions(pose[:, 3:])
+        if steps:
+            path = np.tile(pose, (steps, 1, 1))
+            for k, obstacle in enumerate(several):
+                if obstacle.path is not None:
+                    path[: len(obstacle.path), k] = obstacle.path
+                    path[len(obstacle.path) :, k] = obstacle.path[-1]
+                    path[:, k, :3] -= self.origin
+            self["obstacle_position_path"] = self.numbers(path[..., :3].reshape(-1, 3))
+            self["obstacle_rotation_path"] = self.quaternions(path[..., 3:].reshape(-1, 4))
+        else:
+            self["obstacle_position_before"] = self["obstacle_position"]
+            self["obstacle_rotation_before"] = self["obstacle_rotation"]
+        for name in ("obstacle_velocity", "obstacle_spin"):
+            self[name] = self.zeros(len(several), variant.vec3)
+        first, corners, self.meshes = [], [np.zeros((0, 3))], []
+        for obstacle in several:
+            first.append(sum(map(len, corners)) // 3)
+            if obstacle.shape == "mesh":
+                corners.append(obstacle.vertices[obstacle.faces].reshape(-1, 3))
+                points = wp.array(obstacle.vertices, dtype=wp.vec3, device=self.device)
+                faces = wp.array(obstacle.faces.ravel(), dtype=wp.int32, device=self.device)
+                self.meshes.append(wp.Mesh(points, faces))
+            else:
+                self.meshes.append(None)
+        ids = [0 if mesh is None else mesh.id for mesh in self.meshes]
+        self["meshes"] = wp.array(ids, dtype=wp.uint64, device=self.device)
+        self["first_face"] = wp.array(first, dtype=wp.int32, device=self.device)
+        # a dummy where there is no mesh: arrays of no length have no gradient
+        soup = np.concatenate(corners)
+        self["mesh_corner"] = self.numbers(soup if len(soup) else np.zeros((1, 3)))
+        self["mesh_face"] = self.zeros(len(several) * self["nodes"], wp.int32)
+        self["touches"] = self.zeros(1, wp.int32)
+
+    def node_mass(self) -> float:
+        """Mean mass of a node [kg]."""
+        cloth = self.scene.cloth
+        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
+        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
+        return mass / cloth.nodes
+
+    def quaternions(self, values: np.ndarray) -> wp.array:
+        return wp.array(
+            values.astype(wp.dtype_to_numpy(self.variant.scalar)), dtype=self.variant.quat, device=self.device
+        )
+
+    def struct(self, label: str) -> Any:
+        """Arrays that a kernel takes as one argument, as they are now: Warp copies their addresses."""
+        kinds = {
+            "obstacles": obstacle_contact.structs(self.variant.forward).Obstacles,
+            "law": barrier.structs(self.variant.forward).ContactLaw,
+        }
+        kind = kinds[label]
+        arrays = {name: self[name] for name in kind.vars}
+        addresses = tuple((array.ptr, array.grad and array.grad.ptr) for array in arrays.values())
+        if label not in self._structs or self._structs[label][0] != addresses:
+            made = kind()
+            for name, array in arrays.items():
+                setattr(made, name, array)
+            self._structs[label] = addresses, made
+        return self._structs[label][1]
 
     def _state(self) -> None:
         n, scalar, vec3 = self["nodes"], self.variant.scalar, self.variant.vec3
@@ -247,6 +335,8 @@ class Arrays(dict[str, Any]):
         if label.endswith("_grad"):
             array = self[label.removesuffix("_grad")]
             return None if array is None else array.grad
+        if label in ("obstacles", "law"):
+            return self.struct(label)
         return self[label]
 
     def add_frames(self, count: int) -> None:

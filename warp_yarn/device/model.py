@@ -266,6 +266,35 @@ class Model:
         if self.arrays.contact:
             self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
+        self._find_contacts()
+
+    def _find_contacts(self) -> None:
+        """Looks for what obstacles' contact needs to know of the present positions."""
+        if self.scene.obstacles:
+            self.arrays.zero("touches")
+            if any(self.arrays.meshes):
+                self.launch("find_faces", "node_obstacles")
+
+    def keep_clear(self) -> None:
+        """Lets a stage's iteration start where nothing penetrates."""
+        if self.scene.obstacles:
+            self.launch("start_outside", "nodes")
+
+    def limit_step(self) -> None:
+        """Shortens a step of the iteration so that nothing penetrates."""
+        if self.scene.obstacles:
+            self.launch("limit_to_obstacles", "node_obstacles")
+
+    def report_contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n, g) of every node and obstacle at the present positions, and the forces [nodes, obstacles, 3] (N)."""
+        a = self.arrays
+        self._find_contacts()
+        count = self.scene.cloth.nodes * len(self.scene.obstacles)
+        gaps = a.zeros(count, wp.types.vector(4, a.variant.scalar))
+        forces = a.zeros(count, a.variant.vec3)
+        self.launch("report_contacts", "node_obstacles", gaps=gaps, contact_forces=forces)
+        shape = (self.scene.cloth.nodes, len(self.scene.obstacles), -1)
+        return gaps.numpy().reshape(shape), forces.numpy().reshape(shape)
 
     def press(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
@@ -383,6 +412,26 @@ class Model:
         if "pin_target_path" in a:
             arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
             self.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
+        if self.obstacles_move:
+            # where they were when the positions were made that a stage starts from
+            self.place_obstacles(stage - 1 if stage == 1 else AT_START)
+            self.copy(obstacle_position_before="obstacle_position")
+            self.launch(
+                "copy_rotations",
+                "obstacles",
+                source=a["obstacle_rotation"],
+                target=a["obstacle_rotation_before"],
+            )
+            self.place_obstacles(stage)
+
+    @property
+    def obstacles_move(self) -> bool:
+        """Whether any obstacle has a path."""
+        return "obstacle_position_path" in self.arrays
+
+    def place_obstacles(self, stage: int) -> None:
+        """Puts obstacles to where they are at the time of a stage."""
+        self.launch("place_obstacles", "obstacles", stage=stage, step_duration=self.step_size)
 
     def give_inputs(self, name: str, stage: int) -> None:
         """Adjoint of ``take_inputs`` for one of ``PATHS``."""
@@ -405,9 +454,7 @@ class Model:
             a[name] = a.zeros(count, a.variant.scalar)
         for name in ("steps_to_audit", "audit_due", "alert", "looks_closely", "damps"):
             a[name] = a.zeros(1, wp.int32)
-        cloth = self.scene.cloth
-        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
-        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
+        mass = a.node_mass() * a["nodes"]
         a["still_energy"] = a.numbers(0.5 * mass * STILL**2)
         if self._outer:
             a["outer_force"] = a.zeros(a["nodes"], a.variant.vec3)
@@ -483,6 +530,8 @@ class Model:
             self.launch("add_power", "nodes", force=a["q_x"])
         if "pin_motion" in a and any(term.name == "pins" for term in a.terms):
             self.launch("add_pin_power", "pins", step_duration=self.step_size)
+        if self.obstacles_move:
+            self.launch("add_obstacle_power", "node_obstacles")
 
     def _close_step(self, by_stages: bool) -> None:
         """Compares the energy at the end of a step with the work done in it."""

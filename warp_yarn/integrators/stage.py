@@ -42,6 +42,8 @@ class StageMethod:
     fraction: float
     carried: float
     stages: int
+    keeps_clear = True
+    """Whether contact can be modelled: a step ends with a stage, of which none penetrates."""
     fallback: str | None = None
     """The method that makes a step again that gained energy."""
     local_error: float | None = None
@@ -193,6 +195,7 @@ class StageMethod:
             a.zero("crosses")
             self.model.launch("look_ahead", "segments")
             wp.capture_if(a["crosses"], on_true=lambda: a.zero("euler_solution"))
+        self.model.keep_clear()
         if stage == 0:
             self._evaluate(matrix=True)
         else:
@@ -211,6 +214,8 @@ class StageMethod:
         if self.model.scene.sliding:
             self.model.launch("shortest_segment", "segments")
         self.model.launch("judge", 1)
+        if self.model.scene.obstacles:
+            self.model.launch("ask_where_touching", 1)
 
     def _iterate(self, stage: int) -> None:
         a = self.model.arrays
@@ -239,6 +244,7 @@ class StageMethod:
         self.model.launch("search", 1)
         if self.model.scene.sliding:
             self.model.launch("keep_order", "segments")
+        self.model.limit_step()
         self.model.launch("decide", 1, stage=stage)
 
     @property

@@ -24,7 +24,7 @@ from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels.core import status
 from .linear_system import System, gather
-from .state import CLOTH_NUMBERS, FIELDS, State, Trajectory
+from .state import CLOTH_NUMBERS, FIELDS, Contacts, State, Trajectory
 from .substepping import Parts
 
 CHUNK_BYTES = 1 << 24
@@ -151,6 +151,11 @@ class Simulator:
             if method.local_error is None:
                 able = ", ".join(repr(name) for name, other in INTEGRATORS.items() if other.local_error is not None)
                 raise InputError(f"step_error with integrator = {integrator!r}: only {able} estimates its error")
+        if isinstance(scene, Scene) and scene.obstacles and not method.keeps_clear:
+            able = ", ".join(repr(name) for name, other in INTEGRATORS.items() if other.keeps_clear)
+            raise InputError(
+                f"integrator = {integrator!r} with obstacles: a step may end inside one; must be one of {able}"
+            )
         self._options = {
             "step": step,
             "integrator": integrator,
@@ -206,6 +211,7 @@ class Simulator:
             self._recording: _Recording | None = None
             # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
             self._upload(self._rest())
+            self._check_clear()
         cores = _cores()
         if threads > cores:
             warnings.warn(
@@ -245,6 +251,7 @@ class Simulator:
     def state(self, state: State) -> None:
         state = _checked(state, self.scene.cloth.nodes)
         self._check_order(state)
+        self._check_clear(state)
         self._begin_from(state)
 
     def _state(self) -> State:
@@ -374,6 +381,21 @@ class Simulator:
         border = topology.is_crossing == 0
         if np.abs(state.euler_velocity[border]).max() > 0.0:
             raise InputError("state.euler_velocity is not 0 on the border, where nodes have no Eulerian coordinate")
+
+    def _check_clear(self, state: State | None = None) -> None:
+        """Refuses a state where cloth is nearer to an obstacle than it may come."""
+        if not self.scene.obstacles:
+            return
+        with _Visit(self, state):
+            gaps, _ = self.model.report_contacts()
+        least = float(self.arrays["contact_distance"].numpy()[0])
+        if not gaps[..., 3].min() > least:
+            node, k = np.unravel_index(int(gaps[..., 3].argmin()), gaps.shape[:2])
+            row, column = divmod(int(node), self.scene.cloth.weave.columns)
+            raise InputError(
+                f"node {node} (row {row}, column {column}) is {gaps[node, k, 3]:.3g} m from obstacles[{k}], a "
+                f"{type(self.scene.obstacles[k]).__name__}: must be above the contact's distance, {least:.3g} m"
+            )
 
     def _upload(self, state: State) -> None:
         for name in FIELDS:
@@ -558,6 +580,7 @@ class Simulator:
                 f"above its tolerance of {self.model.newton_tolerance_at(smallest):.1e}"
             ),
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
+            status.OVERLAPPING: "it is pressed into an obstacle that leaves it no way out",
             status.INACCURATE: f"its error stays above step_error = {self.step_error}: allow more",
         }[code]
         raise SimulationError(
@@ -622,6 +645,24 @@ class Simulator:
             return self.arrays["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
 
     @_alone
+    def contacts(self, state: State | None = None) -> Contacts:
+        """Where nodes touch obstacles (None: in the present state).
+
+        Raises:
+            InputError: a scene without obstacles.
+        """
+        if not self.scene.obstacles:
+            raise InputError("this scene has no obstacles, so nothing touches")
+        with _Visit(self, state):
+            gaps, forces = self.model.report_contacts()
+            position = self.arrays["position"].numpy() + self.arrays.origin
+        node, k = np.nonzero(forces.any(axis=2))
+        normal, gap, force = gaps[node, k, :3], gaps[node, k, 3], forces[node, k]
+        load = np.einsum("ij,ij->i", force, normal)
+        place = position[node] - gap[:, None] * normal
+        return Contacts(node, k, gap, normal, load, force - load[:, None] * normal, place)
+
+    @_alone
     def energy(self, state: State | None = None) -> dict[str, float]:
         """Energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.arrays, {}
@@ -632,7 +673,8 @@ class Simulator:
                 if term.energy is not None:
                     energy.zero_()
                     self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
-                    result[term.name] = float(energy.numpy()[0])
+                    name = "contact" if term.touches else term.name
+                    result[name] = result.get(name, 0.0) + float(energy.numpy()[0])
         return result
 
     @_alone
