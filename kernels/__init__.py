@@ -8,7 +8,7 @@ import functools
 
 import warp as wp
 
-from .contact import limits, obstacles
+from .contact import broad_phase, limits, obstacles, self_contact
 from .core.variant import Term, Variant
 from .linear import block_matrix, conjugate_gradient, incomplete_cholesky, multilevel
 from .nonlinear import newton
@@ -42,6 +42,7 @@ _REGISTERED = (
     pins.TERM,
     applied_force.TERM,
     obstacles.TERM,
+    self_contact.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
 TERMS: dict[str, Term] = {term.name: term for term in _REGISTERED}
@@ -65,6 +66,7 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
     for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
     kernels |= vars(limits.define_motion(variant)) | vars(obstacles.define_reports(variant.forward))
+    kernels |= vars(self_contact.define_limits(variant.forward))
     for part in (
         linear,
         block_matrix,
@@ -73,6 +75,7 @@ def build(variant: Variant) -> dict[str, wp.Kernel]:
         multilevel,
         newton,
         limits,
+        broad_phase,
         energy_watch,
         frames,
         linear_adjoint,

@@ -37,11 +37,11 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class ContactLaw:
-        contact_stiffness: wp.array(dtype=scalar)
-        contact_distance: wp.array(dtype=scalar)
-        contact_range: wp.array(dtype=scalar)
-        contact_slip_speed: wp.array(dtype=scalar)
-        contact_damping_speed: wp.array(dtype=scalar)
+        stiffness: wp.array(dtype=scalar)
+        distance: wp.array(dtype=scalar)
+        range: wp.array(dtype=scalar)
+        slip_speed: wp.array(dtype=scalar)
+        damping_speed: wp.array(dtype=scalar)
 
     return SimpleNamespace(ContactLaw=ContactLaw)
 
@@ -57,20 +57,22 @@ def functions(variant: Variant) -> SimpleNamespace:
         left = scalar(1.0) - x
         log = wp.log(x)
         by_x = left / x
-        return vec3(-left * left * log, left * (scalar(2.0) * log - by_x), by_x * (by_x + scalar(4.0)) - scalar(2.0) * log)
+        return vec3(
+            -left * left * log, left * (scalar(2.0) * log - by_x), by_x * (by_x + scalar(4.0)) - scalar(2.0) * log
+        )
 
     @wp.func
     def contact_load(law: ContactLaw, gap: scalar, rate: scalar) -> scalar:
         """f_n."""
-        reach = law.contact_range[0]
-        slope = barrier((gap - law.contact_distance[0]) / reach)[1] * law.contact_stiffness[0] * reach
-        y = -rate / law.contact_damping_speed[0]
+        reach = law.range[0]
+        slope = barrier((gap - law.distance[0]) / reach)[1] * law.stiffness[0] * reach
+        y = -rate / law.damping_speed[0]
         return -slope * scalar(0.5) * (y + wp.sqrt(y * y + scalar(4.0)))
 
     @wp.func
     def contact_friction(law: ContactLaw, speed: scalar) -> scalar:
         """f₁/|v|."""
-        slip = law.contact_slip_speed[0]
+        slip = law.slip_speed[0]
         result = scalar(1.0) / wp.max(speed, slip)
         if speed < slip:
             result = (scalar(2.0) - speed / slip) / slip
@@ -84,7 +86,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         across = v - n * rate
         # of the square, which has a derivative where nothing moves
         square = wp.dot(across, across)
-        by_speed = scalar(2.0) / law.contact_slip_speed[0]
+        by_speed = scalar(2.0) / law.slip_speed[0]
         if square > scalar(0.0):
             by_speed = contact_friction(law, wp.sqrt(square))
         return n * load - across * (friction * load * by_speed)
@@ -95,20 +97,20 @@ def functions(variant: Variant) -> SimpleNamespace:
     ) -> mat33:
         """Part of D and H, by their weights."""
         one = scalar(1.0)
-        reach = law.contact_range[0]
-        b = barrier((gap - law.contact_distance[0]) / reach) * law.contact_stiffness[0]
+        reach = law.range[0]
+        b = barrier((gap - law.distance[0]) / reach) * law.stiffness[0]
         rate = wp.dot(n, v)
-        y = -rate / law.contact_damping_speed[0]
+        y = -rate / law.damping_speed[0]
         root = wp.sqrt(y * y + scalar(4.0))
         sigma = scalar(0.5) * (y + root)
         load = -b[1] * reach * sigma
-        along = weights[2] * b[2] * sigma + weights[1] * load / (root * law.contact_damping_speed[0])
+        along = weights[2] * b[2] * sigma + weights[1] * load / (root * law.damping_speed[0])
         across = v - n * rate
         speed = wp.length(across)
         by_speed = contact_friction(law, speed)
         held = weights[1] * friction * load
         result = wp.outer(n, n) * (along - held * by_speed) + wp.identity(n=3, dtype=scalar) * (held * by_speed)
-        slip = law.contact_slip_speed[0]
+        slip = law.slip_speed[0]
         secant = evaluations > wp.static(CYCLING) and evaluations % 3 == 0
         if speed > scalar(0.0) and not secant:
             falls = -by_speed

@@ -7,9 +7,9 @@
     box, half extents h    φ = |max(|x| − h, 0)|
     triangle mesh          φ = |x − its closest point|, on both sides
 
-All but the mesh are convex, so φ is a convex function, by which ``limits.py`` finds where a line first comes near. Cloth
-stays outside of φ = D > 0, where edges are round and the gradient has no jump; inside, φ of cylinder and box is that of
-the nearest face, as a place to complain of.
+All but the mesh are convex, so φ is a convex function, by which ``limits.py`` finds where a line first comes near.
+Cloth stays outside of φ = D > 0, where edges are round and the gradient has no jump; inside, φ of cylinder and box is
+that of the nearest face, as a place to complain of.
 
 Parameters: ``obstacle_size`` of each obstacle, 3 numbers [m]: r; l and r; l and r; h.
 """

@@ -48,7 +48,10 @@ def functions(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
     vec4 = wp.types.vector(4, scalar)
     Obstacles = structs(variant.forward).Obstacles
-    distance, closest_on_triangle = distances.functions(variant).distance, distances.functions(variant).closest_on_triangle
+    distance, closest_on_triangle = (
+        distances.functions(variant).distance,
+        distances.functions(variant).closest_on_triangle,
+    )
 
     @wp.func
     def to_obstacle(obstacles: Obstacles, k: int, face: int, x: vec3) -> vec4:
@@ -105,7 +108,7 @@ def define(variant: Variant) -> wp.Kernel:
         x = position[i]
         at = to_obstacle(obstacles, k, obstacles.mesh_face[e], x)
         gap = at[3]
-        if gap < law.contact_distance[0] + law.contact_range[0]:
+        if gap < law.distance[0] + law.range[0]:
             n = vec3(at[0], at[1], at[2])
             v = velocity[i] - obstacle_speed(obstacles, k, x)
             wp.atomic_add(force, i, contact_force(law, obstacles.obstacle_friction[k], gap, n, v))
@@ -133,10 +136,10 @@ def define_energy(variant: Variant) -> wp.Kernel:
         e = index(wp.tid())
         count = obstacles.obstacle_shape.shape[0]
         gap = to_obstacle(obstacles, e % count, obstacles.mesh_face[e], position[e / count])[3]
-        reach = law.contact_range[0]
-        x = (gap - law.contact_distance[0]) / reach
+        reach = law.range[0]
+        x = (gap - law.distance[0]) / reach
         if x < scalar(1.0):
-            wp.atomic_add(energy, 0, law.contact_stiffness[0] * reach * reach * barrier_of(x)[0])
+            wp.atomic_add(energy, 0, law.stiffness[0] * reach * reach * barrier_of(x)[0])
 
     return obstacle_energy
 
@@ -152,12 +155,10 @@ def define_reports(variant: Variant) -> SimpleNamespace:
     module = variant.module("contact_reports")
 
     @wp.func
-    def force_on(
-        obstacles: Obstacles, law: ContactLaw, e: int, k: int, x: vec3, velocity: vec3
-    ) -> vec3:
+    def force_on(obstacles: Obstacles, law: ContactLaw, e: int, k: int, x: vec3, velocity: vec3) -> vec3:
         at = to_obstacle(obstacles, k, obstacles.mesh_face[e], x)
         result = vec3()
-        if at[3] > law.contact_distance[0] and at[3] < law.contact_distance[0] + law.contact_range[0]:
+        if at[3] > law.distance[0] and at[3] < law.distance[0] + law.range[0]:
             v = velocity - obstacle_speed(obstacles, k, x)
             result = contact_force(law, obstacles.obstacle_friction[k], at[3], vec3(at[0], at[1], at[2]), v)
         return result

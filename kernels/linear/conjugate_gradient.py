@@ -21,7 +21,7 @@ import warp as wp
 
 from ..core import memory
 from ..core.variant import Variant
-from . import block_matrix, incomplete_cholesky
+from . import block_matrix, incomplete_cholesky, pair_blocks
 from . import threads as teams
 from .threads import call, ended, keep_pace, meet, share, wait_for_call
 
@@ -39,6 +39,7 @@ def define(variant: Variant) -> SimpleNamespace:
         incomplete_cholesky.functions(variant).product,
     )
     total = teams.functions(variant).total
+    add_pairs, Pairs = pair_blocks.functions(variant).add_pairs, pair_blocks.structs(variant).Pairs
     module = variant.module("conjugate_gradient")
     variant.fuse("conjugate_gradient")
 
@@ -199,6 +200,7 @@ def define(variant: Variant) -> SimpleNamespace:
         upper_xs: wp.array(dtype=vec3),
         upper_sx: wp.array(dtype=vec3),
         upper_ss: wp.array(dtype=scalar),
+        pairs: Pairs,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         # right-hand side, and when to stop
@@ -261,6 +263,16 @@ def define(variant: Variant) -> SimpleNamespace:
                         put(p_s, s, zero)
                         start += at(euler_solution, s) * at(euler_solution, s)
             start = total(start, 0, strip, strips, met, team, sums)
+            touch = pairs.any_touch[0] != 0
+            if touch and start != zero:
+                # r = b − C x, the rest of A comes with the sweep
+                for i in range(begin, end):
+                    put(q_x, i, vec3())
+                unused = add_pairs(pairs, begin, end, solution, q_x)
+                for i in range(begin, end):
+                    put(r_x, i, at(r_x, i) - at(q_x, i))
+                met += strips
+                unused = total(unused, 2, strip, strips, met, team, sums)
             # r = E (E + U)⁻ᵀ (b − A x)
             rz = zero
             u = zero
@@ -324,6 +336,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 curvature = total(curvature, 3, strip, strips, met + strips, team, sums)
                 swept += rows
                 met += strips
+                if touch:
+                    met += strips
+                    curvature += total(add_pairs(pairs, begin, end, t_x, q_x), 2, strip, strips, met, team, sums)
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break

@@ -19,7 +19,7 @@ import warp as wp
 
 from ..core import memory
 from ..core.variant import Variant
-from . import block_matrix, incomplete_cholesky, lines
+from . import block_matrix, incomplete_cholesky, lines, pair_blocks
 from . import threads as teams
 from .lines import BLOCKS
 from .threads import call, meet, share, wait_for_call
@@ -140,6 +140,7 @@ def define(variant: Variant) -> SimpleNamespace:
     report = block_matrix.functions(variant).report
     product = incomplete_cholesky.functions(variant).product
     total = teams.functions(variant).total
+    add_pairs, Pairs = pair_blocks.functions(variant).add_pairs, pair_blocks.structs(variant).Pairs
     line = lines.functions(variant)
     factorize_nodes, factorize_coarse = line.factorize_nodes, line.factorize_coarse
     solve_nodes, solve_coarse = line.solve_nodes, line.solve_coarse
@@ -381,6 +382,7 @@ def define(variant: Variant) -> SimpleNamespace:
         upper_sx: wp.array(dtype=vec3),
         upper_ss: wp.array(dtype=scalar),
         levels: Levels,
+        pairs: Pairs,
         # right-hand side, and when to stop
         rhs: wp.array(dtype=vec3),
         euler_rhs: wp.array(dtype=scalar),
@@ -427,11 +429,14 @@ def define(variant: Variant) -> SimpleNamespace:
                     break
             met = team[5]
             unused = zero
+            touch = pairs.any_touch[0] != 0
             for i in range(begin, end):
                 unused += multiply_row(
                     i, stencil, neighbour, levels.lower, diagonal_xx, diagonal_xs, diagonal_ss,
                     upper_xx, upper_xs, upper_sx, upper_ss, solution, euler_solution, q_x, q_s,
                 )  # fmt: skip
+                if touch:
+                    unused += add_pairs(pairs, i, i + 1, solution, q_x)
                 r = at(rhs, i) - at(q_x, i)
                 put(r_x, i, r)
                 put(p_x, i, vec3())
@@ -462,6 +467,8 @@ def define(variant: Variant) -> SimpleNamespace:
                         i, stencil, neighbour, levels.lower, diagonal_xx, diagonal_xs, diagonal_ss,
                         upper_xx, upper_xs, upper_sx, upper_ss, p_x, p_s, q_x, q_s,
                     )  # fmt: skip
+                    if touch:
+                        curvature += add_pairs(pairs, i, i + 1, p_x, q_x)
                 met += strips
                 curvature = total(curvature, 1, strip, strips, met, team, sums)
                 if not (curvature > zero):

@@ -243,6 +243,8 @@ class Contact(Fixed):
         stiffness: κ of a contact [N/m], above 0; None: m (3 m/s / range)², m the mean mass of a node.
         distance: D, how near nodes may come to obstacles [m], above 0; None: the yarns' radius.
         range: d̂, beyond D, over which obstacles push [m], above 0; None: the yarns' radius.
+        self_distance: D of cloth on cloth, between nodes [m], above 0; None: 1.5 spacings, or 3 radii if that is more.
+        self_range: d̂ of cloth on cloth [m], above 0; None: the spacing.
         friction: μ of cloth on cloth, at least 0. (Each obstacle has its own.)
         slip_speed: ε, at which friction reaches μ f_n [m/s], above 0: what sticks creeps, at ε (1 − √(1 − r)) under a
             share r of that.
@@ -257,6 +259,8 @@ class Contact(Fixed):
         stiffness: float | None = None,
         distance: float | None = None,
         range: float | None = None,
+        self_distance: float | None = None,
+        self_range: float | None = None,
         friction: float = 0.3,
         slip_speed: float = 1e-3,
         damping_speed: float | None = 0.5,
@@ -269,6 +273,8 @@ class Contact(Fixed):
         self.stiffness = optional("contact stiffness", stiffness)
         self.distance = optional("contact distance", distance)
         self.range = optional("contact range", range)
+        self.self_distance = optional("contact self_distance", self_distance)
+        self.self_range = optional("contact self_range", self_range)
         self.friction = number("contact friction", friction, least=0.0)
         self.slip_speed = number("contact slip_speed", slip_speed, above=0.0)
         self.damping_speed = optional("contact damping_speed", damping_speed)

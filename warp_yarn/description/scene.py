@@ -56,6 +56,7 @@ class Scene(Fixed):
         terms: the terms to model, by name; None: all that the scene has a use for. ``mass`` is always there.
         published_scaling: take the arguments of eq. 4's tanh in SI units, as published, instead of dimensionless.
         obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
+        self_contact: whether the cloth may touch itself; else it passes through itself.
         contact: the law of contact; None: as ``Contact()``.
     """
 
@@ -73,6 +74,7 @@ class Scene(Fixed):
         terms: Sequence[str] | None = None,
         published_scaling: bool = False,
         obstacles: Sequence[Obstacle] = (),
+        self_contact: bool = False,
         contact: Contact | None = None,
     ):
         if not isinstance(cloth, Cloth):
@@ -95,6 +97,7 @@ class Scene(Fixed):
         if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
             raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
         self.obstacles = tuple(obstacles)
+        self.self_contact = bool(self_contact)
         if contact is not None and not isinstance(contact, Contact):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
@@ -111,6 +114,7 @@ class Scene(Fixed):
             terms=None if terms is None else self.terms,
             published_scaling=self.published_scaling,
             obstacles=self.obstacles,
+            self_contact=self.self_contact,
             contact=contact,
         )
 
@@ -134,7 +138,7 @@ class Scene(Fixed):
             arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
             return [missing if array is None else array for array in arrays]
 
-        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling", "contact")
+        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling", "self_contact", "contact")
         return (
             self.cloth.same_as(other.cloth)
             and len(self.obstacles) == len(other.obstacles)
@@ -184,6 +188,8 @@ class Scene(Fixed):
             missing["pins"] = "there is no pin with a stiffness"
         if not self.obstacles:
             missing["obstacles"] = "there is none"
+        if not self.self_contact:
+            missing["self_contact"] = "self_contact is False"
         if not len(self.force_nodes):
             missing["applied"] = "forces is empty"
         if names is None:

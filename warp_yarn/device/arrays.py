@@ -16,9 +16,13 @@ from ..description.scene import Scene
 from ..kernels import TERMS, Term, Variant, build
 from ..kernels.contact import barrier, distances
 from ..kernels.contact import obstacles as obstacle_contact
-from ..kernels.linear import multilevel
+from ..kernels.linear import multilevel, pair_blocks
 from ..simulation.state import CLOTH_NUMBERS
 
+NEAR_MARGIN = 0.5
+"""Of the list of nodes that are near, in spacings: how far nodes may move relative to each other before a new one."""
+NEAR_ROOM = 32
+"""Nodes near each that there is room for at first."""
 LARGE = 1 << 20
 """Bytes of an array."""
 
@@ -47,8 +51,24 @@ class Arrays(dict[str, Any]):
         self._state()
         self._work()
         self._structs: dict[str, tuple[Any, Any]] = {}
+        law = barrier.structs(variant.forward).ContactLaw
+        self._kinds = {
+            "obstacles": (obstacle_contact.structs(variant.forward).Obstacles, ""),
+            "law": (law, "contact_"),
+            "self_law": (law, "self_contact_"),
+            "pairs": (pair_blocks.structs(variant.forward).Pairs, ""),
+        }
+        """Structs of arrays, and what their arrays' names begin with."""
+        self["any_touch"] = self.zeros(1, wp.int32)
+        if scene.obstacles or scene.self_contact:
+            self["touches"] = self.zeros(1, wp.int32)
         if scene.obstacles:
+            self._law(
+                "contact", scene.contact.distance or scene.cloth.radius, scene.contact.range or scene.cloth.radius
+            )
             self._obstacles(scene)
+        if scene.self_contact:
+            self._self_contact(scene)
         self.dims = {
             "nodes": self["nodes"],
             "segments": len(self["segment_nodes"]),
@@ -122,15 +142,7 @@ class Arrays(dict[str, Any]):
         self["published_scaling"] = int(scene.published_scaling)
 
     def _obstacles(self, scene: Scene) -> None:
-        cloth, contact, variant = scene.cloth, scene.contact, self.variant
-        mass = self.node_mass()
-        reach = contact.range or cloth.radius
-        self["contact_stiffness"] = self.numbers(contact.stiffness or mass * (SPEED / reach) ** 2)
-        self["contact_distance"] = self.numbers(contact.distance or cloth.radius)
-        self["contact_range"] = self.numbers(reach)
-        self["contact_slip_speed"] = self.numbers(contact.slip_speed)
-        self["contact_damping_speed"] = self.numbers(contact.damping_speed or np.inf)
-        several, quat = scene.obstacles, variant.quat
+        several, variant = scene.obstacles, self.variant
         shapes = [getattr(distances, obstacle.shape.upper()) for obstacle in several]
         self["obstacle_shape"] = wp.array(shapes, dtype=wp.int32, device=self.device)
         self["obstacle_size"] = self.numbers([obstacle.size for obstacle in several])
@@ -171,7 +183,41 @@ class Arrays(dict[str, Any]):
         soup = np.concatenate(corners)
         self["mesh_corner"] = self.numbers(soup if len(soup) else np.zeros((1, 3)))
         self["mesh_face"] = self.zeros(len(several) * self["nodes"], wp.int32)
-        self["touches"] = self.zeros(1, wp.int32)
+
+    def _law(self, kind: str, distance: float, reach: float) -> None:
+        contact = self.scene.contact
+        stiffness = contact.stiffness or self.node_mass() * (SPEED / reach) ** 2
+        self[f"{kind}_stiffness"] = self.numbers(stiffness)
+        self[f"{kind}_distance"] = self.numbers(distance)
+        self[f"{kind}_range"] = self.numbers(reach)
+        self[f"{kind}_slip_speed"] = self.numbers(contact.slip_speed)
+        self[f"{kind}_damping_speed"] = self.numbers(contact.damping_speed or np.inf)
+
+    def _self_contact(self, scene: Scene) -> None:
+        cloth, nodes = scene.cloth, self["nodes"]
+        distance = scene.contact.self_distance or max(1.5 * cloth.spacing, 3.0 * cloth.radius)
+        reach = scene.contact.self_range or cloth.spacing
+        self._law("self_contact", distance, reach)
+        self["contact_friction"] = self.numbers(scene.contact.friction)
+        margin = NEAR_MARGIN * cloth.spacing
+        self["near_margin"] = self.numbers(margin)
+        self["near_reach"] = self.numbers(distance + reach + margin)
+        self["folds_from"] = self.numbers(0.5 * np.pi * (distance + reach))
+        self["rest_place"] = self.numbers(cloth.euler.ravel())
+        self["near_count"] = self.zeros(nodes, wp.int32)
+        # far from everywhere: the first look makes a list
+        self["near_position"] = self.numbers(np.full((nodes, 3), np.nan))
+        self["outdated"] = self.zeros(1, wp.int32)
+        side = int(np.clip(max(cloth.weave.rows, cloth.weave.columns) * cloth.spacing / (distance + reach), 8, 128))
+        self.grid = wp.HashGrid(side, side, side, device=self.device, dtype=self.variant.scalar)
+        self.grid.reserve(nodes)
+        self.make_near_room(NEAR_ROOM)
+
+    def make_near_room(self, room: int) -> None:
+        """Makes room for so many nodes near each."""
+        self["near_room"] = room
+        self["near"] = self.zeros(room * self["nodes"], wp.int32)
+        self["near_block"] = self.zeros(room * self["nodes"], self.variant.sym33)
 
     def node_mass(self) -> float:
         """Mean mass of a node [kg]."""
@@ -187,13 +233,12 @@ class Arrays(dict[str, Any]):
 
     def struct(self, label: str) -> Any:
         """Arrays that a kernel takes as one argument, as they are now: Warp copies their addresses."""
-        kinds = {
-            "obstacles": obstacle_contact.structs(self.variant.forward).Obstacles,
-            "law": barrier.structs(self.variant.forward).ContactLaw,
-        }
-        kind = kinds[label]
-        arrays = {name: self[name] for name in kind.vars}
-        addresses = tuple((array.ptr, array.grad and array.grad.ptr) for array in arrays.values())
+        kind, prefix = self._kinds[label]
+        arrays = {name: self[prefix + name] for name in kind.vars if prefix + name in self}
+        addresses = tuple(
+            (array.ptr, array.grad and array.grad.ptr) if isinstance(array, wp.array) else array
+            for array in arrays.values()
+        )
         if label not in self._structs or self._structs[label][0] != addresses:
             made = kind()
             for name, array in arrays.items():
@@ -335,7 +380,7 @@ class Arrays(dict[str, Any]):
         if label.endswith("_grad"):
             array = self[label.removesuffix("_grad")]
             return None if array is None else array.grad
-        if label in ("obstacles", "law"):
+        if label in self._kinds:
             return self.struct(label)
         return self[label]
 

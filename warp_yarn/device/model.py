@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -83,6 +83,17 @@ class Graphs(dict[str, Any]):
         exclusive.replay(self[name])
 
 
+class Near(NamedTuple):
+    """What is near each other: a node with another one, or with an obstacle, the other of which is -1 then."""
+
+    node: np.ndarray
+    other: np.ndarray
+    obstacle: np.ndarray
+    gap: np.ndarray
+    normal: np.ndarray
+    force: np.ndarray
+
+
 class Model:
     """A scene on the device.
 
@@ -119,6 +130,8 @@ class Model:
         if preconditioner is None:
             preconditioner = "multilevel" if self._needs_levels() else "incomplete"
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
+        if scene.self_contact and preconditioner == "jacobi":
+            raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
         exact = differentiable and precision == "double"
         default = EXACT if exact else TOLERANCES[precision]
         self.tolerance = number("tolerance", default if tolerance is None else tolerance, above=0.0)
@@ -270,31 +283,76 @@ class Model:
 
     def _find_contacts(self) -> None:
         """Looks for what obstacles' contact needs to know of the present positions."""
-        if self.scene.obstacles:
-            self.arrays.zero("touches")
-            if any(self.arrays.meshes):
-                self.launch("find_faces", "node_obstacles")
+        if self.touches:
+            self.arrays.zero("touches", "any_touch")
+        if self.scene.obstacles and any(self.arrays.meshes):
+            self.launch("find_faces", "node_obstacles")
+        if self.scene.self_contact:
+            self._keep_list(moves=False)
+
+    @property
+    def touches(self) -> bool:
+        """Whether the scene has contact at all."""
+        return bool(self.scene.obstacles) or self.scene.self_contact
+
+    def _keep_list(self, *, moves: bool) -> None:
+        """Makes a new list of what is near where nodes have moved too far for the last, or would by a step."""
+        self.launch("measure_stray", "nodes", moves=int(moves))
+        wp.capture_if(self.arrays["outdated"], on_true=self._list_near)
+
+    def _list_near(self) -> None:
+        a = self.arrays
+        a.grid.build(a["position"], float(a["near_reach"].numpy()[0]))
+        self.launch("list_near", "nodes", grid=a.grid.id)
 
     def keep_clear(self) -> None:
         """Lets a stage's iteration start where nothing penetrates."""
         if self.scene.obstacles:
             self.launch("start_outside", "nodes")
+        if self.scene.self_contact:
+            self.launch("aim", "nodes")
+            self._limit_to_pairs()
+            self.launch("start_apart", "nodes")
+            self.launch("check_apart", "nodes")
 
     def limit_step(self) -> None:
         """Shortens a step of the iteration so that nothing penetrates."""
         if self.scene.obstacles:
             self.launch("limit_to_obstacles", "node_obstacles")
+        if self.scene.self_contact:
+            self._limit_to_pairs()
 
-    def report_contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, g) of every node and obstacle at the present positions, and the forces [nodes, obstacles, 3] (N)."""
-        a = self.arrays
+    def _limit_to_pairs(self) -> None:
+        self._keep_list(moves=True)
+        self.launch("limit_to_list", "nodes")
+        self.launch("limit_to_pairs", "nodes")
+
+    def report_obstacles(self) -> Near:
+        """Every node and obstacle, and their force."""
+        a, nodes, several = self.arrays, self.scene.cloth.nodes, len(self.scene.obstacles)
         self._find_contacts()
-        count = self.scene.cloth.nodes * len(self.scene.obstacles)
+        gaps, forces = self._reported("report_contacts", "node_obstacles", nodes * several)
+        node, obstacle = np.divmod(np.arange(nodes * several), several)
+        return Near(node, np.full_like(node, -1), obstacle, gaps[:, 3], gaps[:, :3], forces)
+
+    def report_pairs(self) -> Near:
+        """Every two nodes that are near each other, and their force."""
+        a, nodes = self.arrays, self.scene.cloth.nodes
+        self._find_contacts()
+        room = a["near_room"]
+        gaps, forces = self._reported("report_pairs", "nodes", nodes * room)
+        node, slot = np.divmod(np.arange(nodes * room), room)
+        other = a["near"].numpy()
+        kept = (slot < a["near_count"].numpy()[node]) & (node < other)
+        node, other = node[kept], other[kept]
+        return Near(node, other, np.full_like(node, -1), gaps[kept, 3], gaps[kept, :3], forces[kept])
+
+    def _reported(self, kernel: str, elements: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+        a = self.arrays
         gaps = a.zeros(count, wp.types.vector(4, a.variant.scalar))
         forces = a.zeros(count, a.variant.vec3)
-        self.launch("report_contacts", "node_obstacles", gaps=gaps, contact_forces=forces)
-        shape = (self.scene.cloth.nodes, len(self.scene.obstacles), -1)
-        return gaps.numpy().reshape(shape), forces.numpy().reshape(shape)
+        self.launch(kernel, elements, gaps=gaps, contact_forces=forces)
+        return gaps.numpy(), forces.numpy()
 
     def press(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""

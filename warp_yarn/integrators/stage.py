@@ -214,7 +214,7 @@ class StageMethod:
         if self.model.scene.sliding:
             self.model.launch("shortest_segment", "segments")
         self.model.launch("judge", 1)
-        if self.model.scene.obstacles:
+        if self.model.touches:
             self.model.launch("ask_where_touching", 1)
 
     def _iterate(self, stage: int) -> None:

@@ -24,7 +24,8 @@ from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels.core import status
 from .linear_system import System, gather
-from .state import CLOTH_NUMBERS, FIELDS, Contacts, State, Trajectory
+from .contacts import Contacts, contacts_of
+from .state import CLOTH_NUMBERS, FIELDS, State, Trajectory
 from .substepping import Parts
 
 CHUNK_BYTES = 1 << 24
@@ -151,10 +152,10 @@ class Simulator:
             if method.local_error is None:
                 able = ", ".join(repr(name) for name, other in INTEGRATORS.items() if other.local_error is not None)
                 raise InputError(f"step_error with integrator = {integrator!r}: only {able} estimates its error")
-        if isinstance(scene, Scene) and scene.obstacles and not method.keeps_clear:
+        if isinstance(scene, Scene) and (scene.obstacles or scene.self_contact) and not method.keeps_clear:
             able = ", ".join(repr(name) for name, other in INTEGRATORS.items() if other.keeps_clear)
             raise InputError(
-                f"integrator = {integrator!r} with obstacles: a step may end inside one; must be one of {able}"
+                f"integrator = {integrator!r} with contact: a step may end inside something; must be one of {able}"
             )
         self._options = {
             "step": step,
@@ -383,17 +384,29 @@ class Simulator:
             raise InputError("state.euler_velocity is not 0 on the border, where nodes have no Eulerian coordinate")
 
     def _check_clear(self, state: State | None = None) -> None:
-        """Refuses a state where cloth is nearer to an obstacle than it may come."""
+        """Refuses a state where cloth is nearer to an obstacle, or to itself, than it may come."""
+        if self.scene.self_contact:
+            with _Visit(self, state):
+                pairs = self.model.report_pairs()
+            least = float(self.arrays["self_contact_distance"].numpy()[0])
+            if len(pairs.gap) and not pairs.gap.min() > least:
+                k = int(pairs.gap.argmin())
+                places = [divmod(int(node), self.scene.cloth.weave.columns) for node in (pairs.node[k], pairs.other[k])]
+                raise InputError(
+                    f"nodes {pairs.node[k]} and {pairs.other[k]} (row, column {places[0]} and {places[1]}) are "
+                    f"{pairs.gap[k]:.3g} m apart: must be above the contact's self_distance, {least:.3g} m"
+                )
         if not self.scene.obstacles:
             return
         with _Visit(self, state):
-            gaps, _ = self.model.report_contacts()
+            near = self.model.report_obstacles()
         least = float(self.arrays["contact_distance"].numpy()[0])
-        if not gaps[..., 3].min() > least:
-            node, k = np.unravel_index(int(gaps[..., 3].argmin()), gaps.shape[:2])
+        if not near.gap.min() > least:
+            at = int(near.gap.argmin())
+            node, k = near.node[at], near.obstacle[at]
             row, column = divmod(int(node), self.scene.cloth.weave.columns)
             raise InputError(
-                f"node {node} (row {row}, column {column}) is {gaps[node, k, 3]:.3g} m from obstacles[{k}], a "
+                f"node {node} (row {row}, column {column}) is {near.gap[at]:.3g} m from obstacles[{k}], a "
                 f"{type(self.scene.obstacles[k]).__name__}: must be above the contact's distance, {least:.3g} m"
             )
 
@@ -581,6 +594,7 @@ class Simulator:
             ),
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
             status.OVERLAPPING: "it is pressed into an obstacle that leaves it no way out",
+            status.CROWDED: "more of it comes together than there is room for",
             status.INACCURATE: f"its error stays above step_error = {self.step_error}: allow more",
         }[code]
         raise SimulationError(
@@ -646,21 +660,15 @@ class Simulator:
 
     @_alone
     def contacts(self, state: State | None = None) -> Contacts:
-        """Where nodes touch obstacles (None: in the present state).
-
-        Raises:
-            InputError: a scene without obstacles.
-        """
-        if not self.scene.obstacles:
-            raise InputError("this scene has no obstacles, so nothing touches")
+        """Where nodes touch obstacles and each other (None: in the present state)."""
+        found = []
         with _Visit(self, state):
-            gaps, forces = self.model.report_contacts()
             position = self.arrays["position"].numpy() + self.arrays.origin
-        node, k = np.nonzero(forces.any(axis=2))
-        normal, gap, force = gaps[node, k, :3], gaps[node, k, 3], forces[node, k]
-        load = np.einsum("ij,ij->i", force, normal)
-        place = position[node] - gap[:, None] * normal
-        return Contacts(node, k, gap, normal, load, force - load[:, None] * normal, place)
+            if self.scene.obstacles:
+                found.append(self.model.report_obstacles())
+            if self.scene.self_contact:
+                found.append(self.model.report_pairs())
+        return contacts_of(found, position)
 
     @_alone
     def energy(self, state: State | None = None) -> dict[str, float]:

@@ -57,31 +57,6 @@ class State:
         )
 
 
-@dataclasses.dataclass(eq=False, frozen=True)
-class Contacts:
-    """Where nodes touch obstacles: NumPy, a row for each pair of them.
-
-    Args:
-        node, obstacle: which [contacts].
-        gap: distance of the node from the obstacle [contacts] (m).
-        normal: out of the obstacle [contacts, 3].
-        load: force along the normal [contacts] (N), above 0.
-        tangential: friction on the node [contacts, 3] (N).
-        place: of the obstacle's surface, closest to the node [contacts, 3] (m).
-    """
-
-    node: np.ndarray
-    obstacle: np.ndarray
-    gap: np.ndarray
-    normal: np.ndarray
-    load: np.ndarray
-    tangential: np.ndarray
-    place: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.node)
-
-
 FIELDS = tuple(field.name for field in dataclasses.fields(State))
 WIDTHS = {"position": 3, "euler": 2, "velocity": 3, "euler_velocity": 2, "anchor": 2}
 """Numbers of a node."""

@@ -1,0 +1,210 @@
+"""Contact of a cloth with itself, by the law of ``barrier.py`` between balls about its nodes.
+
+    g = |x_p − x_q|,   n = (x_p − x_q)/g,   v = ẋ_p − ẋ_q
+
+Balls of a contact distance of their own: capsules of the yarns' radius would touch at rest already, where neighbours
+lie side by side and yarns cross in one node. Each node takes the force of its own pairs, and each pair is the same from
+both sides, to the last bit but for the sign, so that momentum is conserved to rounding.
+
+Friction is of the nodes' velocities: two that stick and turn as one about each other are braked as well, above
+ε/g of spin (0.4 rad/s of the paper's cloth).
+
+Parameters: those of ``barrier.py``, with ``self_`` before them; ``contact_friction`` μ.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..core.indexing import index
+from ..core.status import OVERLAPPING
+from ..core.variant import Term, Variant
+from ..linear import pair_blocks
+from . import barrier
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
+    contact_force, contact_matrix = barrier.functions(variant).force, barrier.functions(variant).matrix
+    ContactLaw = barrier.structs(variant.forward).ContactLaw
+    Pairs = pair_blocks.structs(variant.forward).Pairs
+
+    @variant.kernel("self_contact")
+    def self_contact_term(
+        pairs: Pairs,
+        self_law: ContactLaw,
+        contact_friction: wp.array(dtype=scalar),
+        # state in
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        tries: wp.array(dtype=int),
+        # forces out, and whether anything touches
+        force: wp.array(dtype=vec3),
+        touches: wp.array(dtype=int),
+        any_touch: wp.array(dtype=int),
+        # matrix out
+        matrix: int,
+        weights: wp.array(dtype=vec3),
+        diagonal_xx: wp.array(dtype=mat33),
+        near_block: wp.array(dtype=sym33),
+    ):
+        p = index(wp.tid())
+        first = p * pairs.near_room
+        for k in range(first, first + pairs.near_count[p]):
+            q = index(pairs.near[k])
+            r = position[p] - position[q]
+            gap = wp.length(r)
+            if matrix != 0:
+                near_block[k] = sym33()
+            if gap < self_law.distance[0] + self_law.range[0]:
+                n = r / gap
+                v = velocity[p] - velocity[q]
+                wp.atomic_add(force, p, contact_force(self_law, contact_friction[0], gap, n, v))
+                touches[0] = 1
+                any_touch[0] = 1
+                if matrix != 0:
+                    b = contact_matrix(self_law, contact_friction[0], gap, n, v, weights[0], tries[0])
+                    wp.atomic_add(diagonal_xx, p, b)
+                    near_block[k] = sym33(b[0, 0], b[0, 1], b[0, 2], b[1, 1], b[1, 2], b[2, 2])
+
+    return self_contact_term
+
+
+def define_energy(variant: Variant) -> wp.Kernel:
+    scalar, vec3 = variant.scalar, variant.vec3
+    barrier_of = barrier.functions(variant).barrier
+    ContactLaw = barrier.structs(variant.forward).ContactLaw
+    Pairs = pair_blocks.structs(variant.forward).Pairs
+
+    @variant.kernel("self_contact")
+    def self_contact_energy(
+        pairs: Pairs, self_law: ContactLaw, position: wp.array(dtype=vec3), energy: wp.array(dtype=scalar)
+    ):
+        p = index(wp.tid())
+        reach = self_law.range[0]
+        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+            x = (wp.length(position[p] - position[pairs.near[k]]) - self_law.distance[0]) / reach
+            if x < scalar(1.0):
+                # a half, since every pair is in two lists
+                v = self_law.stiffness[0] * reach * reach * barrier_of(x)[0]
+                wp.atomic_add(energy, 0, scalar(0.5) * v)
+
+    return self_contact_energy
+
+
+@functools.cache
+def define_limits(variant: Variant) -> SimpleNamespace:
+    """What keeps pairs apart from iterate to iterate, and reports them."""
+    scalar, vec3 = variant.scalar, variant.vec3
+    contact_force = barrier.functions(variant).force
+    ContactLaw = barrier.structs(variant).ContactLaw
+    Pairs = pair_blocks.structs(variant).Pairs
+    vec4 = wp.types.vector(4, scalar)
+    module = variant.module("self_contact_limits")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def limit_to_pairs(
+        pairs: Pairs,
+        self_contact_distance: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        step_length: wp.array(dtype=scalar),
+    ):
+        """Shortens a step to where two nodes first come nearer than it may: a quadratic equation (``limits.py``)."""
+        p = index(wp.tid())
+        distance = self_contact_distance[0]
+        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+            q = index(pairs.near[k])
+            r = position[p] - position[q]
+            move = (direction[p] - direction[q]) * stage_size[0]
+            b = wp.dot(r, move)
+            if p < q and b < scalar(0.0):
+                limit = distance + scalar(wp.static(0.1)) * (wp.length(r) - distance)
+                c = wp.dot(r, r) - limit * limit
+                square = b * b - wp.dot(move, move) * c
+                if square > scalar(0.0):
+                    part = c / (wp.sqrt(square) - b)
+                    if part < scalar(1.0):
+                        wp.atomic_min(step_length, 0, part)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def aim(
+        stage_size: wp.array(dtype=scalar),
+        base_position: wp.array(dtype=vec3),
+        solution: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        step_length: wp.array(dtype=scalar),
+    ):
+        """The way from the last state to where a stage's iteration would start, as a step of that."""
+        i = index(wp.tid())
+        direction[i] = (base_position[i] - position[i]) / stage_size[0] + solution[i]
+        step_length[0] = scalar(1.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def start_apart(
+        stage_size: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
+        base_position: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        step_length: wp.array(dtype=scalar),
+        direction: wp.array(dtype=vec3),
+        solution: wp.array(dtype=vec3),
+    ):
+        """Starts where the way may lead to. What is held goes all of it."""
+        i = index(wp.tid())
+        if is_free[i] != 0 and step_length[0] < scalar(1.0):
+            solution[i] = (position[i] - base_position[i]) / stage_size[0] + direction[i] * step_length[0]
+        direction[i] = vec3()
+
+    @wp.kernel(module=module, enable_backward=False)
+    def report_pairs(
+        pairs: Pairs,
+        self_law: ContactLaw,
+        contact_friction: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=vec4),
+        contact_forces: wp.array(dtype=vec3),
+    ):
+        """(n, g) of what is near, and the force on a node of those that touch it."""
+        p = index(wp.tid())
+        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+            r = position[p] - position[pairs.near[k]]
+            gap = wp.length(r)
+            n = r / gap
+            gaps[k] = vec4(n[0], n[1], n[2], gap)
+            if gap > self_law.distance[0] and gap < self_law.distance[0] + self_law.range[0]:
+                v = velocity[p] - velocity[pairs.near[k]]
+                contact_forces[k] = contact_force(self_law, contact_friction[0], gap, n, v)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_apart(
+        pairs: Pairs,
+        self_contact_distance: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        base_position: wp.array(dtype=vec3),
+        solution: wp.array(dtype=vec3),
+        status: wp.array(dtype=int),
+    ):
+        """Whether a stage starts with all apart: not where what is held is pressed together."""
+        p = index(wp.tid())
+        x = base_position[p] + solution[p] * stage_size[0]
+        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+            q = index(pairs.near[k])
+            if wp.length(x - base_position[q] - solution[q] * stage_size[0]) <= self_contact_distance[0]:
+                if wp.atomic_cas(status, 0, 0, wp.static(OVERLAPPING)) == 0:
+                    status[1] = p
+
+    return SimpleNamespace(
+        check_apart=check_apart,
+        limit_to_pairs=limit_to_pairs,
+        aim=aim,
+        start_apart=start_apart,
+        report_pairs=report_pairs,
+    )
+
+
+TERM = Term(name="self_contact", elements="nodes", define=define, energy=define_energy, touches=True)
