@@ -17,7 +17,7 @@ import warp as wp
 from ..core.indexing import index
 from ..core.status import OVERLAPPING
 from ..core.variant import Variant
-from . import distances, obstacles
+from . import obstacles
 from .distances import MESH
 
 LEFT = 0.1
@@ -30,7 +30,6 @@ PLACES = 24
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
     to_obstacle = obstacles.functions(variant).to_obstacle
-    closest_on_triangle = distances.functions(variant).closest_on_triangle
     Obstacles = obstacles.structs(variant.forward).Obstacles
     module = variant.module("contact_limits")
 

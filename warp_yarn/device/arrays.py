@@ -373,7 +373,8 @@ class Arrays(dict[str, Any]):
         dim = self.dims[elements] if isinstance(elements, str) else elements
         if dim:
             inputs = [replaced[a.label] if a.label in replaced else self.find(a.label) for a in kernel.adj.args]
-            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+            # what has no reverse is no part of a tape
+            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=kernel.options["enable_backward"])
 
     def find(self, label: str) -> Any:
         """What a kernel's argument of this name stands for; ``x_grad`` is the gradient of ``x``."""

@@ -329,7 +329,7 @@ class Model:
 
     def report_obstacles(self) -> Near:
         """Every node and obstacle, and their force."""
-        a, nodes, several = self.arrays, self.scene.cloth.nodes, len(self.scene.obstacles)
+        nodes, several = self.scene.cloth.nodes, len(self.scene.obstacles)
         self._find_contacts()
         gaps, forces = self._reported("report_contacts", "node_obstacles", nodes * several)
         node, obstacle = np.divmod(np.arange(nodes * several), several)

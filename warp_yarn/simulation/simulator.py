@@ -23,8 +23,8 @@ from ..device.model import Graphs, Model
 from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels.core import status
-from .linear_system import System, gather
 from .contacts import Contacts, contacts_of
+from .linear_system import System, gather
 from .state import CLOTH_NUMBERS, FIELDS, State, Trajectory
 from .substepping import Parts
 
