@@ -59,9 +59,7 @@ class Arrays(dict[str, Any]):
             "pairs": (pair_blocks.structs(variant.forward).Pairs, ""),
         }
         """Structs of arrays, and what their arrays' names begin with."""
-        self["any_touch"] = self.zeros(1, wp.int32)
-        if scene.obstacles or scene.self_contact:
-            self["touches"] = self.zeros(1, wp.int32)
+        self["touching"] = self.zeros(3, wp.int32)
         if scene.obstacles:
             self._law(
                 "contact", scene.contact.distance or scene.cloth.radius, scene.contact.range or scene.cloth.radius

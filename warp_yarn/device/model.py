@@ -284,7 +284,7 @@ class Model:
     def _find_contacts(self) -> None:
         """Looks for what obstacles' contact needs to know of the present positions."""
         if self.touches:
-            self.arrays.zero("touches", "any_touch")
+            self.arrays.zero("touching")
         if self.scene.obstacles and any(self.arrays.meshes):
             self.launch("find_faces", "node_obstacles")
         if self.scene.self_contact:

@@ -116,6 +116,8 @@ class StageMethod:
                 if estimates:
                     model.copy(predicted="solution")
             self._newton(stage)
+            if model.touches and model.watches and self.fallback is not None:
+                model.launch("refuse_impact", 1)
             model.add_work(self._shares[stage])
         if estimates:
             model.launch("estimate_error", 1)

@@ -486,7 +486,7 @@ class Simulator:
         gained, damped = False, parts.damped
         if self.step_error is None:
             # it could not be made at once
-            gained = parts.can_damp and int(self.arrays["status"].numpy()[0]) == status.GAINED
+            gained = parts.can_damp and int(self.arrays["status"].numpy()[0]) in (status.GAINED, status.IMPACT)
             self._restore(frame)
             self.arrays.put("status", 0, 0, 0)
             parts.size = 1.0 if gained else 0.5
@@ -595,6 +595,7 @@ class Simulator:
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
             status.OVERLAPPING: "it is pressed into an obstacle that leaves it no way out",
             status.CROWDED: "more of it comes together than there is room for",
+            status.IMPACT: "something strikes it",
             status.INACCURATE: f"its error stays above step_error = {self.step_error}: allow more",
         }[code]
         raise SimulationError(
