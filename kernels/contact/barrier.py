@@ -31,7 +31,7 @@ CYCLING = 12
 between sticking and sliding for ever. (Always, Newton's iteration would creep.)"""
 
 
-FAST = 0.3
+FAST = 0.05
 """Part of its range by which a contact's gap may change in a step of two stages: the second one's base is extrapolated
 from the first, and gains up to half of an impact's energy beyond."""
 TOUCHES, PAIRS_TOUCH, IMPACTS = 0, pair_blocks.PAIRS, 2
