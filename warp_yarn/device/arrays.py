@@ -203,8 +203,7 @@ class Arrays(dict[str, Any]):
         self["folds_from"] = self.numbers(0.5 * np.pi * (distance + reach))
         self["rest_place"] = self.numbers(cloth.euler.ravel())
         self["near_count"] = self.zeros(nodes, wp.int32)
-        # far from everywhere: the first look makes a list
-        self["near_position"] = self.numbers(np.full((nodes, 3), np.nan))
+        self["near_position"] = self.zeros(nodes, self.variant.vec3)
         self["outdated"] = self.zeros(1, wp.int32)
         side = int(np.clip(max(cloth.weave.rows, cloth.weave.columns) * cloth.spacing / (distance + reach), 8, 128))
         self.grid = wp.HashGrid(side, side, side, device=self.device, dtype=self.variant.scalar)
@@ -212,10 +211,12 @@ class Arrays(dict[str, Any]):
         self.make_near_room(NEAR_ROOM)
 
     def make_near_room(self, room: int) -> None:
-        """Makes room for so many nodes near each."""
+        """Makes room for so many nodes near each; the next look makes a list."""
         self["near_room"] = room
         self["near"] = self.zeros(room * self["nodes"], wp.int32)
         self["near_block"] = self.zeros(room * self["nodes"], self.variant.sym33)
+        # far from everywhere
+        self["near_position"].fill_(np.nan)
 
     def node_mass(self) -> float:
         """Mean mass of a node [kg]."""

@@ -98,6 +98,12 @@ class StageMethod:
         """Launches a part of the step."""
         self._graphs.run(part.__name__, part)
 
+    def forget_graphs(self) -> None:
+        """Captures anew, after arrays have changed their place."""
+        self._graphs.clear()
+        if hasattr(self, "_around"):
+            self.prepare_adjoint(*self._around)
+
     # -- forward -----------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:

@@ -478,12 +478,28 @@ class Simulator:
         status = self.arrays["status"].numpy()
         return int(status[2]) - 1 - first if status[0] else steps
 
+    def _make_room(self) -> None:
+        """Makes room for twice as many nodes near each: what was captured has the arrays of before."""
+        with ALONE:
+            self.arrays.make_near_room(2 * self.arrays["near_room"])
+        self.integrator.forget_graphs()
+        self.parts.forget_graphs()
+
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
         ledger = {name: self.arrays[name].numpy().copy() for name in LEDGER if name in self.arrays}
         parts = self.parts
         self._step_in_parts = _StepInParts(frame, (parts.size, parts.made, parts.rejected, parts.damped), ledger)
         gained, damped = False, parts.damped
+        while int(self.arrays["status"].numpy()[0]) == status.CROWDED:
+            self._make_room()
+            self._restore(frame)
+            self.arrays.put("status", 0, 0, 0)
+            self._count(frame)
+            self.integrator.advance()
+            if not self.arrays["status"].numpy()[0]:
+                self._step_in_parts = None
+                return True
         if self.step_error is None:
             # it could not be made at once
             gained = parts.can_damp and int(self.arrays["status"].numpy()[0]) in (status.GAINED, status.IMPACT)

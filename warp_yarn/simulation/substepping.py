@@ -53,6 +53,12 @@ class Parts:
         self.size = self.tried = 1.0
         self.made = self.rejected = self.damped = 0
 
+    def forget_graphs(self) -> None:
+        """Captures anew, after arrays have changed their place."""
+        self._graphs.clear()
+        if self._fallback is not None:
+            self._fallback.forget_graphs()
+
     def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
 
