@@ -59,6 +59,7 @@ class Arrays(dict[str, Any]):
             "pairs": (pair_blocks.structs(variant.forward).Pairs, ""),
         }
         """Structs of arrays, and what their arrays' names begin with."""
+        self["tries"] = self.zeros(1, wp.int32)
         self["touching"] = self.zeros(3, wp.int32)
         if scene.obstacles:
             self._law(
