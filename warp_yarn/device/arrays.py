@@ -202,11 +202,11 @@ class Arrays(dict[str, Any]):
         self["near_margin"] = self.numbers(margin)
         self["near_reach"] = self.numbers(distance + reach + margin)
         self["folds_from"] = self.numbers(0.5 * np.pi * (distance + reach))
-        self["rest_place"] = self.numbers(cloth.euler.ravel())
+        self["rest_place"] = self.numbers(cloth.rest_place.ravel())
         self["near_count"] = self.zeros(nodes, wp.int32)
         self["near_position"] = self.zeros(nodes, self.variant.vec3)
         self["outdated"] = self.zeros(1, wp.int32)
-        side = int(np.clip(max(cloth.weave.rows, cloth.weave.columns) * cloth.spacing / (distance + reach), 8, 128))
+        side = int(np.clip(np.sqrt(nodes) * cloth.spacing / (distance + reach), 8, 128))
         self.grid = wp.HashGrid(side, side, side, device=self.device, dtype=self.variant.scalar)
         self.grid.reserve(nodes)
         self.make_near_room(NEAR_ROOM)
@@ -222,9 +222,8 @@ class Arrays(dict[str, Any]):
     def node_mass(self) -> float:
         """Mean mass of a node [kg]."""
         cloth = self.scene.cloth
-        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
-        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
-        return mass / cloth.nodes
+        density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
+        return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
 
     def quaternions(self, values: np.ndarray) -> wp.array:
         return wp.array(

@@ -391,9 +391,9 @@ class Simulator:
             least = float(self.arrays["self_contact_distance"].numpy()[0])
             if len(pairs.gap) and not pairs.gap.min() > least:
                 k = int(pairs.gap.argmin())
-                places = [divmod(int(node), self.scene.cloth.weave.columns) for node in (pairs.node[k], pairs.other[k])]
+                places = [self.scene.cloth.place(node) for node in (pairs.node[k], pairs.other[k])]
                 raise InputError(
-                    f"nodes {pairs.node[k]} and {pairs.other[k]} (row, column {places[0]} and {places[1]}) are "
+                    f"nodes {pairs.node[k]} and {pairs.other[k]} ({places[0]} and {places[1]}) are "
                     f"{pairs.gap[k]:.3g} m apart: must be above the contact's self_distance, {least:.3g} m"
                 )
         if not self.scene.obstacles:
@@ -404,9 +404,8 @@ class Simulator:
         if not near.gap.min() > least:
             at = int(near.gap.argmin())
             node, k = near.node[at], near.obstacle[at]
-            row, column = divmod(int(node), self.scene.cloth.weave.columns)
             raise InputError(
-                f"node {node} (row {row}, column {column}) is {near.gap[at]:.3g} m from obstacles[{k}], a "
+                f"node {node} ({self.scene.cloth.place(node)}) is {near.gap[at]:.3g} m from obstacles[{k}], a "
                 f"{type(self.scene.obstacles[k]).__name__}: must be above the contact's distance, {least:.3g} m"
             )
 
@@ -592,10 +591,9 @@ class Simulator:
         iterations = int(self.arrays["iterations"].numpy()[0])
         self.arrays.put("status", 0, 0, 0)
         term = self._blame(node)
-        columns = self.scene.cloth.weave.columns
         where = f"step {k} (t = {k * self.step_size:g} s):"
         if node >= 0:
-            where += f" at node {node} (row {node // columns}, column {node % columns})"
+            where += f" at node {node} ({self.scene.cloth.place(node)})"
         smallest = self.parts.tried * self.step_size
         what = {
             status.NOT_FINITE: "a value is not finite",
