@@ -9,6 +9,7 @@ import functools
 
 import warp as wp
 
+from .contact import broad_phase, limits, obstacles, self_contact
 from .core.variant import Term, TermParameter, Variant
 from .linear import (
     block_matrix,
@@ -47,6 +48,8 @@ _OWN = (
     wind.TERM,
     pins.TERM,
     applied_force.TERM,
+    obstacles.TERM,
+    self_contact.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
 TERMS: dict[str, Term] = {term.name: term for term in _OWN}
@@ -119,6 +122,9 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
+    kernels |= vars(limits.define_motion(variant))
+    for reports in (obstacles.define_reports, self_contact.define_limits):
+        kernels |= vars(reports(variant.forward))
     for part in (
         linear,
         block_matrix,
@@ -129,6 +135,8 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         dirk,
         newton,
         line_search,
+        limits,
+        broad_phase,
         energy_watch,
         frames,
         linear_adjoint,

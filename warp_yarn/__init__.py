@@ -6,6 +6,8 @@ from types import ModuleType
 
 from . import moved
 from .description.cloth import Cloth, Yarn
+from .description.cloths import Cloths
+from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
@@ -26,18 +28,26 @@ __version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
     "WEAVES",
+    "Box",
+    "Capsule",
     "Cloth",
+    "Cloths",
+    "Contact",
+    "Cylinder",
     "GradientError",
     "InputError",
+    "Plane",
     "Published",
     "Scene",
     "SimulationError",
     "Simulator",
+    "Sphere",
     "StageMethod",
     "State",
     "Term",
     "TermParameter",
     "Trajectory",
+    "TriangleMesh",
     "Variant",
     "WarpYarnError",
     "Weave",

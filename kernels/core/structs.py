@@ -14,8 +14,9 @@ from .variant import Variant
 
 @functools.cache
 def structs(variant: Variant) -> SimpleNamespace:
-    """Make the structs of a variant: BlockMatrix, SolverWork, SolveReport, NewtonControl, StateAdjoint and Levels."""
+    """Make the structs of a variant."""
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
+    quat = variant.quat
 
     @wp.struct
     class BlockMatrix:
@@ -122,7 +123,36 @@ def structs(variant: Variant) -> SimpleNamespace:
         coarse_r: wp.array(dtype=vec3)
         coarse_z: wp.array(dtype=vec3)
 
+    @wp.struct
+    class Pairs:
+        """Nodes that are near each other: of each node ``near_room`` places, of which ``near_count`` are taken, and the
+        matrix block of those that touch it, which is 0 for the others."""
+
+        near_room: int
+        near_count: wp.array(dtype=int)
+        near: wp.array(dtype=int)
+        near_block: wp.array(dtype=sym33)
+        touching: wp.array(dtype=int)
+
+    @wp.struct
+    class Obstacles:
+        """Of each obstacle: shape, size, friction, pose, velocity ṗ and spin ω. Of a mesh: the first of its faces among
+        ``mesh_corner``, three to a face; and of each node and mesh the face to take the closest point from."""
+
+        obstacle_shape: wp.array(dtype=int)
+        obstacle_size: wp.array(dtype=vec3)
+        obstacle_friction: wp.array(dtype=scalar)
+        obstacle_position: wp.array(dtype=vec3)
+        obstacle_rotation: wp.array(dtype=quat)
+        obstacle_velocity: wp.array(dtype=vec3)
+        obstacle_spin: wp.array(dtype=vec3)
+        first_face: wp.array(dtype=int)
+        mesh_corner: wp.array(dtype=vec3)
+        mesh_face: wp.array(dtype=int)
+
     return SimpleNamespace(
+        Pairs=Pairs,
+        Obstacles=Obstacles,
         BlockMatrix=BlockMatrix,
         SolverWork=SolverWork,
         SolveReport=SolveReport,

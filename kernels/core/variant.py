@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "pins", "applied")
+ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "pins", "applied", "node_obstacles")
 """What a term's kernel may run over."""
 
 
@@ -35,8 +35,16 @@ class Variant:
         return wp.types.vector(3, self.scalar)
 
     @property
+    def quat(self) -> type:
+        return {wp.float64: wp.quatd, wp.float32: wp.quatf}[self.scalar]
+
+    @property
     def mat33(self) -> type:
         return wp.types.matrix((3, 3), self.scalar)
+
+    @property
+    def vec4(self) -> type:
+        return wp.types.vector(4, self.scalar)
 
     @property
     def sym33(self) -> type:
@@ -117,6 +125,8 @@ class Term:
     next as well, 6 the diagonal ones as well."""
     needs_contact: bool = False
     """Whether the term reads the contact force of every crossing."""
+    touches: bool = False
+    """Whether the term is contact, whose energies are told together."""
     sliding_only: bool = False
     """Whether the term vanishes identically where yarns do not slide."""
     presses: bool = False

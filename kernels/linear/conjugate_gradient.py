@@ -22,8 +22,9 @@ import warp as wp
 from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
-from . import block_matrix, incomplete_cholesky
+from . import block_matrix, incomplete_cholesky, pair_blocks
 from . import threads as synchronization
+from .pair_blocks import PAIRS_TOUCH
 from .threads import barrier, begin_solve, ended, keep_pace, partition, wait_for_solve
 
 
@@ -37,7 +38,8 @@ def define(variant: Variant) -> SimpleNamespace:
     times, upper_product, subtract_transposed = shared.times, shared.upper_product, shared.subtract_transposed
     write_report = shared.write_report
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
-    SolveReport = structs(variant).SolveReport
+    SolveReport, Pairs = structs(variant).SolveReport, structs(variant).Pairs
+    add_pairs = pair_blocks.functions(variant).add_pairs
     symmetric, product = (
         incomplete_cholesky.functions(variant).symmetric,
         incomplete_cholesky.functions(variant).product,
@@ -172,6 +174,7 @@ def define(variant: Variant) -> SimpleNamespace:
         nodes: int,
         columns: int,
         blocks: BlockMatrix,
+        pairs: Pairs,
         inverse_pivot: wp.array(dtype=sym33),
         inverse_s: wp.array(dtype=scalar),
         # right-hand side, and when to stop
@@ -222,6 +225,16 @@ def define(variant: Variant) -> SimpleNamespace:
                         store(work.p_s, s, zero)
                         start += load(euler_solution, s) * load(euler_solution, s)
             start = total(start, 0, thread, threads, arrived, signals, work.sums)
+            pairs_touch = pairs.touching[wp.static(PAIRS_TOUCH)] != 0
+            if pairs_touch and start != zero:
+                # r = b − C x, the rest of A comes with the sweep
+                for i in range(begin, end):
+                    store(work.q_x, i, vec3())
+                unused = add_pairs(pairs, begin, end, solution, work.q_x)
+                for i in range(begin, end):
+                    store(work.r_x, i, load(work.r_x, i) - load(work.q_x, i))
+                arrived += threads
+                unused = total(unused, 2, thread, threads, arrived, signals, work.sums)
             # r = E (E + U)⁻ᵀ (b − A x)
             rz = zero
             u = zero
@@ -287,6 +300,10 @@ def define(variant: Variant) -> SimpleNamespace:
                 curvature = total(curvature, 3, thread, threads, arrived + threads, signals, work.sums)
                 swept += rows
                 arrived += threads
+                if pairs_touch:
+                    arrived += threads
+                    of_pairs = add_pairs(pairs, begin, end, work.t_x, work.q_x)
+                    curvature += total(of_pairs, 2, thread, threads, arrived, signals, work.sums)
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break

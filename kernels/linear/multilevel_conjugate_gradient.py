@@ -8,8 +8,9 @@ import warp as wp
 from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
-from . import block_matrix, incomplete_cholesky, multilevel
+from . import block_matrix, incomplete_cholesky, multilevel, pair_blocks
 from . import threads as synchronization
+from .pair_blocks import PAIRS_TOUCH
 from .threads import barrier, begin_solve, partition, wait_for_solve
 
 _ROW = (
@@ -83,7 +84,8 @@ def define(variant: Variant) -> SimpleNamespace:
     total = synchronization.functions(variant).total
     precondition, barriers = multilevel.functions(variant).precondition, multilevel.functions(variant).barriers
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
-    SolveReport, Levels = structs(variant).SolveReport, structs(variant).Levels
+    SolveReport, Levels, Pairs = structs(variant).SolveReport, structs(variant).Levels, structs(variant).Pairs
+    add_pairs = pair_blocks.functions(variant).add_pairs
     module = variant.module("multilevel")
     variant.fuse("multilevel")
 
@@ -108,6 +110,7 @@ def define(variant: Variant) -> SimpleNamespace:
         nodes: int,
         blocks: BlockMatrix,
         levels: Levels,
+        pairs: Pairs,
         # right-hand side, and when to stop
         rhs: wp.array(dtype=vec3),
         euler_rhs: wp.array(dtype=scalar),
@@ -142,10 +145,13 @@ def define(variant: Variant) -> SimpleNamespace:
                     break
             arrived = signals[5]
             unused = zero
+            pairs_touch = pairs.touching[wp.static(PAIRS_TOUCH)] != 0
             for i in range(begin, end):
                 unused += multiply_row(
                     i, blocks, levels.lower, solution, euler_solution, work.q_x, work.q_s,
                 )  # fmt: skip
+                if pairs_touch:
+                    unused += add_pairs(pairs, i, i + 1, solution, work.q_x)
                 r = load(rhs, i) - load(work.q_x, i)
                 store(work.r_x, i, r)
                 store(work.p_x, i, vec3())
@@ -175,6 +181,8 @@ def define(variant: Variant) -> SimpleNamespace:
                     curvature += multiply_row(
                         i, blocks, levels.lower, work.p_x, work.p_s, work.q_x, work.q_s,
                     )  # fmt: skip
+                    if pairs_touch:
+                        curvature += add_pairs(pairs, i, i + 1, work.p_x, work.q_x)
                 arrived += threads
                 curvature = total(curvature, 1, thread, threads, arrived, signals, work.sums)
                 if not (curvature > zero):

@@ -18,7 +18,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..description.cloth import Cloth
+from ..description.cloths import Cloths
 from ..description.scene import Scene
+from ..description.weave import Weave
 from ..device.arrays import STATE_TYPES
 from ..errors import InputError, finite_array, integer, real
 from ..gradients.rollout import Rollout
@@ -160,7 +163,7 @@ class CalibrationProblem:
 
     def field(self, residuals: np.ndarray) -> np.ndarray:
         """Shapes residuals as [frames, rows, columns, 3]."""
-        weave = self.scene.cloth.weave
+        weave = _weave(self.scene.cloth)
         return residuals.reshape(-1, weave.rows, weave.columns, 3)
 
     def scene_with(self, values: np.ndarray) -> Scene:
@@ -242,7 +245,7 @@ def chosen_frames(scene: Scene, target: Trajectory, frames: int | None, first: i
     Raises:
         InputError: a target of another size, not finite, or with fewer frames.
     """
-    ours, theirs = scene.cloth.weave, target.cloth.weave
+    ours, theirs = _weave(scene.cloth), _weave(target.cloth)
     if (ours.rows, ours.columns) != (theirs.rows, theirs.columns):
         raise InputError(
             f"target has {theirs.rows} × {theirs.columns} nodes, must have the scene's {ours.rows} × {ours.columns}"
@@ -301,3 +304,10 @@ def with_paths(scene: Scene, start: np.ndarray, first: int | Fraction, ratio: Fr
         forces = enumerate(scene.forces.items())
         changes["forces"] = {node: f if f.ndim == 1 else path[:-1, k] for k, (node, f) in forces}
     return scene.replace(**changes)
+
+
+def _weave(cloth: Cloth | Cloths) -> Weave:
+    """Finds the weave of a single cloth, or raises an InputError."""
+    if isinstance(cloth, Cloths):
+        raise InputError("a scene of several cloths cannot be learned from, must have one")
+    return cloth.weave

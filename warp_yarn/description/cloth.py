@@ -175,10 +175,11 @@ class Cloth(Fixed):
     def __repr__(self) -> str:
         return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"
 
-    def same_as(self, other: Cloth) -> bool:
+    def same_as(self, other: Any) -> bool:
         """Tells whether another one is made of the same, whatever their weaves are called."""
         return (
-            np.array_equal(self.weave.flipped, other.weave.flipped)
+            isinstance(other, Cloth)
+            and np.array_equal(self.weave.flipped, other.weave.flipped)
             and [dataclasses.replace(yarn, color=None) for yarn in self.yarns]
             == [dataclasses.replace(yarn, color=None) for yarn in other.yarns]
             and all(getattr(self, name) == getattr(other, name) for name in CLOTH_NUMBERS)
@@ -217,6 +218,21 @@ class Cloth(Fixed):
         if not -rows <= row < rows or not -columns <= column < columns:
             raise InputError(f"node (row {row}, column {column}) is outside a cloth of {rows} × {columns}")
         return int(column % columns + (row % rows) * columns)
+
+    @property
+    def columns(self) -> int:
+        """Nodes of a warp yarn, which threads divide among them."""
+        return self.weave.columns
+
+    def place(self, node: int) -> str:
+        """Where a node is, in words."""
+        row, column = divmod(int(node), self.weave.columns)
+        return f"row {row}, column {column}"
+
+    @property
+    def rest_place(self) -> np.ndarray:
+        """(u, v) at rest [nodes, 2], by which arcs along the cloth are compared (m)."""
+        return self.euler
 
     def corners(self, which: str = "all") -> list[int]:
         """Lists the nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""

@@ -12,6 +12,8 @@ import numpy as np
 from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
 from .cloth import Cloth, Fixed
+from .cloths import Cloths, as_one
+from .obstacles import Contact, Obstacle
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,7 @@ class Scene(Fixed):
     another one.
 
     Args:
-        cloth: the cloth.
+        cloth: the cloth, or several, whose nodes are numbered on from one to the next (``Cloths``).
         gravity: acceleration [m/s²], 3 numbers, or None.
         wind: a Wind, or None.
         pins: nodes that are held, such as ``cloth.corners("top")``.
@@ -57,11 +59,14 @@ class Scene(Fixed):
         published_scaling: take the arguments of eq. 4's tanh in SI units, as published, instead of dimensionless.
         parameters: of registered terms: {name: value}, in the unit and range that the term gives them. One of the yarns
             takes a number for all materials, or one for each; a vector 3 numbers. What is left out has its default.
+        obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
+        self_contact: whether the cloth may touch itself; else it passes through itself.
+        contact: the law of contact; None: as ``Contact()``.
     """
 
     def __init__(
         self,
-        cloth: Cloth,
+        cloth: Cloth | Cloths | Sequence[Cloth],
         *,
         gravity: Sequence[float] | None = (0.0, 0.0, -9.8),
         wind: Wind | None = None,
@@ -73,28 +78,36 @@ class Scene(Fixed):
         terms: Sequence[str] | None = None,
         published_scaling: bool = False,
         parameters: Mapping[str, Any] | None = None,
+        obstacles: Sequence[Obstacle] = (),
+        self_contact: bool = False,
+        contact: Contact | None = None,
     ):
-        if not isinstance(cloth, Cloth):
-            raise InputError(f"cloth = {cloth!r}, must be a Cloth")
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
-        self.cloth = cloth
+        self.cloth = as_one(cloth)
         self.gravity = None if gravity is None else finite_array("gravity", gravity, (3,))
         self.wind = wind
-        self.pins = indices("pins", pins, cloth.nodes, "node")
+        self.pins = indices("pins", pins, self.cloth.nodes, "node")
         self.pin_stiffness = None if pin_stiffness is None else real("pin_stiffness", pin_stiffness, above=0.0)
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
         checked = self._checked_forces(forces)
-        self.force_nodes = indices("forces", list(checked), cloth.nodes, "node")
+        self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
         self.force_path = self._force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
         self._parameters = self._checked_parameters(parameters)
+        if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
+            raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
+        self.obstacles = tuple(obstacles)
+        self.self_contact = bool(self_contact)
+        if contact is not None and not isinstance(contact, Contact):
+            raise InputError(f"contact = {contact!r}, must be a Contact or None")
+        self.contact = Contact() if contact is None else contact
         self.terms = self._terms(terms)
         self._fix(
-            cloth=cloth,
+            cloth=self.cloth,
             gravity=self.gravity,
             wind=wind,
             pins=self.pins,
@@ -105,6 +118,9 @@ class Scene(Fixed):
             terms=None if terms is None else self.terms,
             published_scaling=self.published_scaling,
             parameters=self._parameters,
+            obstacles=self.obstacles,
+            self_contact=self.self_contact,
+            contact=contact,
         )
 
     def __repr__(self) -> str:
@@ -144,9 +160,21 @@ class Scene(Fixed):
             arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
             return [missing if array is None else array for array in arrays]
 
-        names = ("wind", "pin_stiffness", "sliding", "terms", "published_scaling", "parameters")
+        names = (
+            "wind",
+            "pin_stiffness",
+            "sliding",
+            "terms",
+            "published_scaling",
+            "parameters",
+            "self_contact",
+            "contact",
+        )
         return (
             self.cloth.same_as(other.cloth)
+            and len(self.obstacles) == len(other.obstacles)
+            and all(mine.same_as(its) for mine, its in zip(self.obstacles, other.obstacles, strict=True))
+            and self.contact == other.contact
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )

@@ -11,12 +11,13 @@ import numpy as np
 import warp as wp
 
 from ..description.cloth import Cloth
+from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
-from . import declarations
+from . import contact, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
 
@@ -31,10 +32,12 @@ class Arrays(DeclaredArrays):
 
     Attributes:
         origin: where positions on the device are counted from [m].
+        meshes: of each obstacle Warp's mesh, or None; kept for as long as kernels look into them.
     """
 
     def __init__(self, scene: Scene, variant: Variant, device: Any):
         self.scene = scene
+        self.meshes: list[wp.Mesh | None] = []
         self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
@@ -57,14 +60,22 @@ class Arrays(DeclaredArrays):
             "pin step": 0 if scene.pin_path is None else scene.pin_path[..., 0].size,
             "applied": len(scene.force_nodes),
             "applied step": scene.force_path[..., 0].size,
+            **contact.sizes(scene),
         }
         dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "pin")}
-        dims["applied"] = sizes["applied"]
+        dims |= {"applied": sizes["applied"], "obstacles": sizes["obstacle"], "node_obstacles": sizes["node obstacle"]}
         super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)
         for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
             self.make(group)
+        contact.set_arrays(self)
+
+    def node_mass(self) -> float:
+        """Compute the mean mass of a node [kg]."""
+        cloth = self.scene.cloth
+        density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
+        return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
 
     def _indices(self, name: str, values: np.ndarray) -> None:
         """Set an index array, or None where the scene has no use for it."""
@@ -74,7 +85,7 @@ class Arrays(DeclaredArrays):
         shared = {"dtype": field.dtype(self.variant), "device": self.device, "copy": False}
         self[name] = wp.array(np.ascontiguousarray(values), **shared) if there else None
 
-    def _topology(self, cloth: Cloth) -> None:
+    def _topology(self, cloth: Cloth | Cloths) -> None:
         topology, yarn = cloth.topology, cloth.topology.segment_yarn
         free = np.ones(topology.nodes, dtype=np.int32)
         if "hard pins" in self.conditions:
@@ -84,7 +95,7 @@ class Arrays(DeclaredArrays):
             "neighbour": topology.neighbour[:, : self.stencil].ravel(),
             "is_free": free,
         }
-        counts = {"nodes": topology.nodes, "columns": cloth.weave.columns, "stencil": self.stencil}
+        counts = {"nodes": topology.nodes, "columns": cloth.columns, "stencil": self.stencil}
         for name in declarations.TOPOLOGY:
             if name in counts:
                 self[name] = counts[name]

@@ -78,6 +78,7 @@ STATE: Group = {
 """What a step leaves to the next."""
 
 STEP: Group = {
+    "evaluations": Field("world", 1, "int", "", "always", "of the residual in this stage"),
     "status": Field("world", 3, "int", "", "always", "what went wrong (core/status.py), its node or -1, its step"),
     "counters": Field("world", 2, "int", "", "always", "the present frame of the chunk, and the present step"),
     "step_size": Field("world", 1, "scalar", "s", "always", "h"),
@@ -172,6 +173,51 @@ LEVELS: Group = {
 }
 """Of the multilevel preconditioner (``description/levels.py``): one struct, ``arrays["levels"]``."""
 
+CONTACT: Group = {
+    "touching": Field("world", 3, "int", "", "always", "whether anything touches, two nodes, anything so fast"),
+    "obstacle_velocity": Field("obstacle", 1, "vec3", "m/s", "obstacles", "ṗ"),
+    "obstacle_spin": Field("obstacle", 1, "vec3", "rad/s", "obstacles", "ω"),
+    "mesh_face": Field("node obstacle", 1, "int", "", "obstacles", "face of a mesh that a node is closest to"),
+    "near_room": Field("count", 1, "int", "", "always", "places of a node in the list of what is near"),
+    "near_count": Field("node", 1, "int", "", "self-contact", "how many of them are taken"),
+    "near": Field("near", 1, "int", "", "self-contact", "nodes that are near it"),
+    "near_block": Field("near", 1, "sym33", "kg", "self-contact", "matrix block of those that touch it, or 0"),
+    "near_position": Field("node", 1, "vec3", "m", "self-contact", "where nodes were when the list was made"),
+    "outdated": Field("world", 1, "int", "", "self-contact", "whether it has to be made anew"),
+}
+"""What contact finds (``kernels/contact``)."""
+
+CONTACT_INPUTS: Group = {
+    "contact_stiffness": Field("world", 1, "scalar", "N/m", "obstacles", "κ of nodes on obstacles"),
+    "contact_distance": Field("world", 1, "scalar", "m", "obstacles", "D"),
+    "contact_range": Field("world", 1, "scalar", "m", "obstacles", "d̂"),
+    "contact_slip_speed": Field("world", 1, "scalar", "m/s", "obstacles", "ε"),
+    "contact_damping_speed": Field("world", 1, "scalar", "m/s", "obstacles", "v_d"),
+    "self_contact_stiffness": Field("world", 1, "scalar", "N/m", "self-contact", "κ of nodes on nodes"),
+    "self_contact_distance": Field("world", 1, "scalar", "m", "self-contact", "D"),
+    "self_contact_range": Field("world", 1, "scalar", "m", "self-contact", "d̂"),
+    "self_contact_slip_speed": Field("world", 1, "scalar", "m/s", "self-contact", "ε"),
+    "self_contact_damping_speed": Field("world", 1, "scalar", "m/s", "self-contact", "v_d"),
+    "contact_friction": Field("world", 1, "scalar", "", "self-contact", "μ of cloth on cloth"),
+    "near_margin": Field("world", 1, "scalar", "m", "self-contact", "beyond D + d̂ of the list of what is near"),
+    "rest_place": Field("node", 2, "scalar", "m", "self-contact", "(u, v) at rest, far apart on different cloths"),
+    "obstacle_shape": Field("obstacle", 1, "int", "", "obstacles", "as contact/distances.py numbers them"),
+    "obstacle_size": Field("obstacle", 1, "vec3", "m", "obstacles", "what a shape has for numbers"),
+    "obstacle_friction": Field("obstacle", 1, "scalar", "", "obstacles", "μ"),
+    "obstacle_position": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of a stage"),
+    "obstacle_rotation": Field("obstacle", 1, "quat", "", "obstacles", "R"),
+    "obstacle_position_before": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of the state before"),
+    "obstacle_rotation_before": Field("obstacle", 1, "quat", "", "obstacles", "R"),
+    "obstacle_position_start": Field("obstacle", 1, "vec3", "m", "obstacles move", "p before the first step"),
+    "obstacle_rotation_start": Field("obstacle", 1, "quat", "", "obstacles move", "R"),
+    "obstacle_position_path": Field("obstacle step", 1, "vec3", "m", "obstacles move", "p after every step"),
+    "obstacle_rotation_path": Field("obstacle step", 1, "quat", "", "obstacles move", "R"),
+    "meshes": Field("obstacle", 1, "uint64", "", "obstacles", "Warp's mesh, or 0"),
+    "first_face": Field("obstacle", 1, "int", "", "obstacles", "of a mesh, among all faces"),
+    "mesh_corner": Field("mesh corner", 1, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
+}
+"""What a scene says of contact. What it does not have is not in the arrays at all."""
+
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
     "increment": Field("node", 1, "vec3", "m/s", "always", "velocities whose momentum the right-hand side has"),
@@ -209,7 +255,6 @@ NEWTON_WORKSPACE: Group = {
     "contraction": Field("world", 1, "scalar", "", "always", "of the last two steps"),
     "step_length": Field("world", 1, "scalar", "", "always", "α of the line search"),
     "shortest": Field("world", 1, "scalar", "m", "always", "smallest Δs"),
-    "evaluations": Field("world", 1, "int", "", "always", "of the residual in this stage"),
     "steps": Field("world", 1, "int", "", "always", "along a δ in this stage"),
     "newton_iterations": Field("world", 1, "int", "", "always", "in this step"),
     "iterate": Field("world", 1, "int", "", "always", "whether to go on"),
@@ -294,6 +339,10 @@ LAUNCH: Group = {
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),
     "share": Field("launch", 1, "scalar", "", "always", "of a stage in what a step makes"),
     "step_duration": Field("launch", 1, "scalar", "s", "always", "h of a whole step"),
+    "moves": Field("launch", 1, "int", "", "always", "whether to look at where a step would lead"),
+    "grid": Field("launch", 1, "uint64", "", "always", "Warp's hash grid"),
+    "gaps": Field("launch", 1, "vec4", "1, m", "always", "(n, g) of what is near"),
+    "contact_forces": Field("launch", 1, "vec3", "N", "always", "of what touches"),
     "source": Field("launch", 1, "any", "", "always", "array to copy"),
     "target": Field("launch", 1, "any", "", "always", "array to copy into"),
     "array": Field("launch", 1, "any", "", "always", "array to clear"),
@@ -317,6 +366,8 @@ GROUPS: dict[str, Group] = {
     "LinearWorkspace": LINEAR_WORKSPACE,
     "ThreadsWorkspace": THREADS_WORKSPACE,
     "Levels": LEVELS,
+    "Contact": CONTACT,
+    "ContactInputs": CONTACT_INPUTS,
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,

@@ -32,10 +32,7 @@ class EnergyWatch:
         # the reaction of pins that are moved exactly is nowhere at hand
         self.on = not (model.has_hard_pins and model.scene.pin_path is not None)
         a.make(declarations.ENERGY_WATCH)
-        cloth = model.scene.cloth
-        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
-        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
-        a.put("still_energy", 0.5 * mass * STILL**2)
+        a.put("still_energy", 0.5 * a.node_mass() * a["nodes"] * STILL**2)
         if self._outer:
             a.make(declarations.OUTER_FORCES)
         a.put("gain", BLOW_UP if a.variant.reverse else GAIN)
@@ -61,7 +58,7 @@ class EnergyWatch:
             wp.capture_if(self.model.arrays["audit_due"], on_true=self._audit)
 
     def _audit(self) -> None:
-        if "pins move" in self.model.arrays.conditions:
+        if self.model.inputs.move:
             self.model.inputs.load(AT_START)
         self.model.add_contact_load()
         self.model.arrays.zero("energy", "elastic_energy", "height_energy")
@@ -110,6 +107,7 @@ class EnergyWatch:
             self.model.launch("add_power", "nodes", force=a["q_x"])
         if "pins move" in a.conditions and any(term.name == "pins" for term in a.terms):
             self.model.launch("add_pin_power", "pins", step_duration=self.model.step_size)
+        self.model.contact.add_power()
 
     def end_step(self, *, by_stages: bool) -> None:
         """Compares the energy at the end of a step with the work done in it."""

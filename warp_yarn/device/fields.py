@@ -17,8 +17,8 @@ class Field:
         element: what it has an entry of: a key of ``Arrays.sizes``, "count" of a number that all launches share, or
             "launch" of what a launch says itself.
         count: how many to an element.
-        kind: its type: "scalar" (of the variant), "int", "vec3", "mat33", "sym33", "vec3i", "vec4i"; "any" of what
-            stands for one array or another.
+        kind: its type: "scalar" (of the variant), "int", "uint64", "vec3", "vec4", "quat", "mat33", "sym33", "vec3i",
+            "vec4i"; "any" of what stands for one array or another.
         unit: SI, "" of what has none.
         when: the condition of the scene under which it is there.
         meaning: what it is.
@@ -33,7 +33,7 @@ class Field:
 
     def dtype(self, variant: Variant) -> Any:
         """Find the Warp type of an entry."""
-        fixed = {"int": wp.int32, "vec3i": wp.vec3i, "vec4i": wp.vec4i}
+        fixed = {"int": wp.int32, "uint64": wp.uint64, "vec3i": wp.vec3i, "vec4i": wp.vec4i}
         return fixed[self.kind] if self.kind in fixed else getattr(variant, self.kind)
 
 
@@ -60,5 +60,8 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "pins move": scene.pin_path is not None,
         "has forces": len(scene.force_nodes) > 0,
         "forces change": len(scene.force_nodes) > 0 and len(scene.force_path) > 1,
+        "obstacles": len(scene.obstacles) > 0,
+        "obstacles move": any(obstacle.path is not None for obstacle in scene.obstacles),
+        "self-contact": scene.self_contact,
     }
     return {name for name, value in holds.items() if value}

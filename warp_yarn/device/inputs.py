@@ -1,4 +1,4 @@
-"""Inputs that change from step to step: moving pins and applied forces (``kernels/stepping/frames.py``)."""
+"""Inputs that change from step to step: moving pins and obstacles, applied forces (``kernels/stepping/frames.py``)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Inputs:
         self.model = model
 
     def load(self, stage: int = 0) -> None:
-        """Puts pins and applied forces of a stage of this step in place, where they change."""
+        """Puts pins, obstacles and applied forces of a stage of this step in place, where they change."""
         a = self.model.arrays
         if "forces change" in a.conditions:
             path, values = a["applied_force_path"], a["applied_force"]
@@ -26,6 +26,12 @@ class Inputs:
         if "pins move" in a.conditions:
             arrays = {"start": a["pin_start"], "path": a["pin_target_path"], "motion": a["pin_motion"]}
             self.model.launch("move_along", "pins", stage=stage, values=a["pin_target"], **arrays)
+        self.model.contact.load(stage)
+
+    @property
+    def move(self) -> bool:
+        """Whether anything is elsewhere at another time of a step."""
+        return "pins move" in self.model.arrays.conditions or self.model.contact.obstacles_move
 
     def scatter_gradient(self, name: str, stage: int) -> None:
         """Reverses ``load`` for one of ``PATHS``."""

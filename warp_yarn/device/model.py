@@ -17,6 +17,7 @@ from ..errors import InputError, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build
 from . import defaults
 from .arrays import Arrays
+from .contact import Contact
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
 from .inputs import Inputs
@@ -43,6 +44,7 @@ class Model:
         arrays: by the names that kernels use.
         kernels: by name.
         inputs: those that change from step to step.
+        contact: what the cloth touches.
         energy: the watch over it.
         threads: processor cores that share a linear solve.
         has_hard_pins: whether pins are exact.
@@ -70,6 +72,8 @@ class Model:
         if preconditioner is None:
             preconditioner = defaults.preconditioner(scene, self.step_size)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
+        if scene.self_contact and preconditioner == "jacobi":
+            raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
         exact = differentiable and precision == "double"
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
@@ -90,6 +94,7 @@ class Model:
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
         self.inputs = Inputs(self)
+        self.contact = Contact(self)
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
@@ -167,6 +172,7 @@ class Model:
         if self.arrays.contact:
             self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
+        self.contact.find()
 
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
@@ -227,7 +233,7 @@ class Model:
         """
         if self.scene.sliding:
             self.launch("check_order", "segments")
-        if "pins move" in self.arrays.conditions:
+        if self.inputs.move:
             # pins are looked at where they are now, not where they were at the last stage's time
             self.inputs.load(AT_END)
         self.energy.end_step(by_stages=by_stages)

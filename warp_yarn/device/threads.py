@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..description.cloths import Cloths
 from ..errors import InputError
 from . import declarations
 
@@ -44,6 +45,8 @@ class Threads:
                 f"threads = {asked}, must be 1 on {model.device} with the {model.preconditioner!r} preconditioner: "
                 "only the CPU's 'incomplete' and 'multilevel' ones share their work"
             )
+        if asked > 1 and isinstance(model.scene.cloth, Cloths):
+            raise InputError(f"threads = {asked} with several cloths, must be 1: threads share the columns of one")
         self.count = max(1, min(asked, a["columns"] // NARROWEST))
         a.sizes |= {"thread": self.count, "signal": 16 + 16 * self.count}
         a.make(declarations.LINEAR_WORKSPACE)

@@ -22,6 +22,7 @@ class LinearlyImplicitEuler:
     order = 1
     local_error = None
     fallback = None
+    keeps_clear = False
 
     def __init__(self, model: Model):
         self.model = model

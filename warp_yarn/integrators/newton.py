@@ -25,8 +25,8 @@ class Newton:
     Nor may crossings change their order.
     """
 
-    def __init__(self, model: Model):
-        self.model = model
+    def __init__(self, model: Model, *, has_fallback: bool):
+        self.model, self.has_fallback = model, has_fallback
         a = model.arrays
         a.make(declarations.STAGES)
         if "base_position" not in a:  # two methods may work on one model, one after the other
@@ -58,12 +58,20 @@ class Newton:
             a.zero("order_would_be_lost")
             self.model.launch("check_initial_guess", "segments")
             wp.capture_if(a["order_would_be_lost"], on_true=lambda: a.zero("euler_solution"))
+        self.model.contact.keep_clear()
         if stage == 0:
             self.evaluate(matrix=True)
+            # where it starts with one already, the rest need not be made
+            self.refuse_impact()
         else:
             self._evaluate_as_asked()
         self._control()
         wp.capture_while(a["iterate"], lambda: self._iterate(stage))
+
+    def refuse_impact(self) -> None:
+        """Leave an impact to the fallback of a method that has one."""
+        if self.has_fallback:
+            self.model.contact.refuse_impact()
 
     def _evaluate_as_asked(self) -> None:
         wp.capture_if(
@@ -76,6 +84,7 @@ class Newton:
         if self.model.scene.sliding:
             self.model.launch("shortest_segment", "segments")
         self.model.launch("control_newton", 1)
+        self.model.contact.ask_for_matrix()
 
     def _iterate(self, stage: int) -> None:
         a = self.model.arrays
@@ -104,4 +113,5 @@ class Newton:
         self.model.launch("begin_line_search", 1)
         if self.model.scene.sliding:
             self.model.launch("limit_step_length", "segments")
+        self.model.contact.limit_step()
         self.model.launch("check_convergence", 1, stage=stage)

@@ -31,7 +31,7 @@ class StageMethod:
 
     def __init__(self, model: Model):
         self.model = model
-        self.newton = Newton(model)
+        self.newton = Newton(model, has_fallback=self.fallback is not None)
         self.set_times(model.step_size, model.step_size)
         self._graphs = GraphCache(model.device)
 
@@ -60,6 +60,7 @@ class StageMethod:
                 if estimates:
                     model.copy(predicted="solution")
             self.newton.solve(stage)
+            self.newton.refuse_impact()
             model.energy.add_work(self._shares[stage])
         if estimates:
             model.launch("estimate_error", 1)
@@ -115,6 +116,12 @@ class StageMethod:
             base_velocity="velocity",
             base_euler_velocity="euler_velocity",
         )
+
+    def forget_graphs(self) -> None:
+        """Captures anew, after arrays have changed their place."""
+        self._graphs.clear()
+        if hasattr(self, "_adjoint"):
+            self.prepare_adjoint(*self._adjoint.around)
 
     def prepare_adjoint(self, before: Callable[[], None], after: Callable[[int], None]) -> None:
         """Makes room for the adjoints within a step, and records what the tape reverses."""

@@ -28,7 +28,7 @@ class StageAdjoint:
     """
 
     def __init__(self, method: StageMethod, before: Callable[[], None], after: Callable[[int], None]):
-        self.method, self.model, self._around = method, method.model, (before, after)
+        self.method, self.model, self.around = method, method.model, (before, after)
         self._graphs = GraphCache(method.model.device)
         tolerance = max(method.model.tolerance, 10.0 * ROUNDING[method.model.precision])
         model, a = method.model, method.model.arrays
@@ -70,7 +70,7 @@ class StageAdjoint:
     def _restore(self) -> None:
         """Restores the step that ends at the present frame; the running adjoints go to the base."""
         model, a = self.model, self.model.arrays
-        before, _ = self._around
+        before, _ = self.around
         before()
         model.launch("count", 1, by=-1)
         model.launch("restore_frame", "nodes")
@@ -102,7 +102,7 @@ class StageAdjoint:
     def _enter_first(self) -> None:
         """Enters the stage before it, and w̄ of what it carried to the next."""
         model, a = self.model, self.model.arrays
-        _, after = self._around
+        _, after = self.around
         after(1)
         model.inputs.load()
         model.launch("restore_frame", "nodes")
@@ -134,5 +134,5 @@ class StageAdjoint:
         if self.model.has_hard_pins:
             self.pin_tape.backward()
         self.model.copy(**{f"{name}_grad": f"base_{name}_grad" for name in STATE})
-        _, after = self._around
+        _, after = self.around
         after(0)

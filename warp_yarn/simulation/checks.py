@@ -12,6 +12,7 @@ import numpy as np
 from ..description.scene import Scene
 from ..errors import InputError, integer, real
 from ..integrators import INTEGRATORS
+from ..integrators.stage import StageMethod
 from .state import State
 
 CHUNK_BYTES = 1 << 24
@@ -50,6 +51,25 @@ def checked_state(state: Any, scene: Scene) -> State:
     if np.abs(state.euler_velocity[border]).max() > 0.0:
         raise InputError("state.euler_velocity is not 0 on the border, where nodes have no Eulerian coordinate")
     return state
+
+
+def check_contact(scene: Scene, integrator: str) -> None:
+    """Refuses contact with a method whose steps end elsewhere than a stage, of which none penetrates.
+
+    Raises:
+        InputError: such a method.
+    """
+    if not isinstance(scene, Scene) or not (scene.obstacles or scene.self_contact):
+        return
+
+    def ends_with_a_stage(method: type) -> bool:
+        return issubclass(method, StageMethod) and (method.stages == 2 or not method.carried)
+
+    if not ends_with_a_stage(INTEGRATORS[integrator]):
+        able = ", ".join(repr(name) for name, method in INTEGRATORS.items() if ends_with_a_stage(method))
+        raise InputError(
+            f"integrator = {integrator!r} with contact: a step may end inside something; must be one of {able}"
+        )
 
 
 def checked_chunk(chunk: int | None, nodes: int) -> int:

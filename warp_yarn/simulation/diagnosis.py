@@ -41,10 +41,9 @@ class Failure:
             step_error: that was allowed, in spacings of the yarns.
         """
         model, node, term = self.model, self.node, blamed(forces, self.node)
-        columns = model.scene.cloth.weave.columns
         where = f"step {step} (t = {step * model.step_size:g} s):"
         if node >= 0:
-            where += f" at node {node} (row {node // columns}, column {node % columns})"
+            where += f" at node {node} ({model.scene.cloth.place(node)})"
         smallest = substepping.last_size * model.step_size
         what = {
             status.NOT_FINITE: "a value is not finite",
@@ -58,6 +57,9 @@ class Failure:
                 f"above its tolerance of {model.newton_tolerance_at(smallest):.1e}"
             ),
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
+            status.OVERLAPPING: "it is pressed into something that leaves it no way out",
+            status.CROWDED: "more of it comes together than there is room for",
+            status.IMPACT: "something strikes it",
             status.INACCURATE: f"its error stays above step_error = {step_error}: allow more",
         }[self.code]
         return SimulationError(

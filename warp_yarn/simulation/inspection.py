@@ -6,10 +6,13 @@ import threading
 
 import numpy as np
 
+from ..device.contact import Near
 from ..device.model import Model
 from ..errors import InputError
+from ..kernels.core.status import CROWDED
 from .alone import alone
 from .checks import checked_state
+from .contacts import Contacts, contacts_of
 from .linear_system import LinearSystem, read_system
 from .state import FIELDS, State
 from .stepper import Stepper
@@ -73,6 +76,53 @@ class Inspection:
             return a["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
 
     @alone
+    def contacts(self, state: State | None = None) -> Contacts:
+        """Finds where nodes touch obstacles and each other (None: in the present state)."""
+        contact, found = self.model.contact, []
+        with _Visit(self.stepper, state):
+            position = self.model.arrays["position"].numpy() + self.model.arrays.origin
+            if contact.obstacles:
+                found.append(contact.near_obstacles())
+            if contact.self_contact:
+                found.append(self._near_pairs())
+        return contacts_of(found, position)
+
+    def _near_pairs(self) -> Near:
+        """Reports the nodes that are near each other, with room for all of them."""
+        found = self.model.contact.near_pairs()
+        while int(self.model.arrays["status"].numpy()[0]) == CROWDED:
+            self.stepper.make_room()
+            found = self.model.contact.near_pairs()
+        return found
+
+    @alone
+    def check_clear(self, state: State | None = None) -> None:
+        """Refuses a state where cloth is nearer to an obstacle, or to itself, than it may come.
+
+        Raises:
+            InputError: the two places that are nearest, and how near.
+        """
+        contact, place = self.model.contact, self.model.scene.cloth.place
+        with _Visit(self.stepper, state):
+            found = [self._near_pairs()] if contact.self_contact else []
+            found += [contact.near_obstacles()] if contact.obstacles else []
+        for near in found:
+            if not len(near.gap):
+                continue
+            k = int(near.gap.argmin())
+            node, other, obstacle = int(near.node[k]), int(near.other[k]), int(near.obstacle[k])
+            of_pair = other >= 0
+            name = "self_contact_distance" if of_pair else "contact_distance"
+            least = float(self.model.arrays[name].numpy()[0])
+            if not near.gap[k] > least:
+                kind = "" if of_pair else type(self.model.scene.obstacles[obstacle]).__name__
+                it = f"node {other} ({place(other)})" if of_pair else f"obstacles[{obstacle}], a {kind}"
+                raise InputError(
+                    f"node {node} ({place(node)}) is {near.gap[k]:.3g} m from {it}: must be above the contact's "
+                    f"{'self_distance' if of_pair else 'distance'}, {least:.3g} m"
+                )
+
+    @alone
     def energy(self, state: State | None = None) -> dict[str, float]:
         """Computes the energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.model.arrays, {}
@@ -83,7 +133,9 @@ class Inspection:
                 if term.energy is not None:
                     energy.zero_()
                     self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
-                    result[term.name] = float(energy.numpy()[0])
+                    # what touches is told as one
+                    name = "contact" if term.touches else term.name
+                    result[name] = result.get(name, 0.0) + float(energy.numpy()[0])
         return result
 
     @alone

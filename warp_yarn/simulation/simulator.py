@@ -18,7 +18,7 @@ from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
 from .alone import alone
-from .checks import LARGEST, checked_chunk, checked_state, checked_step_error, warn_of_threads
+from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
 from .diagnosis import Failure
 from .frames import Frames
 from .inspection import Inspection
@@ -127,6 +127,8 @@ class Simulator(Inspection):
             self.chunk = self.stepper.frames.chunk
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
+        if self.model.contact.on:
+            self.check_clear()
         warn_of_threads(threads)
 
     parts = renamed_attribute("parts", "substepping")
@@ -154,7 +156,10 @@ class Simulator(Inspection):
     @state.setter
     @alone
     def state(self, state: State) -> None:
-        self.stepper.begin_from(checked_state(state, self.scene))
+        state = checked_state(state, self.scene)
+        if self.model.contact.on:
+            self.check_clear(state)
+        self.stepper.begin_from(state)
 
     @property
     @alone
@@ -254,6 +259,7 @@ def _made(
     if max_iterations is not None:
         integer("max_iterations", max_iterations, least=1, most=LARGEST)
     step_error = checked_step_error(step_error, integrator, differentiable)
+    check_contact(scene, integrator)
     model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, **options)
     model.energy.on = model.energy.on and bool(energy_watch)
     refuse_recording(model.device)

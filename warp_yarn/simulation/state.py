@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
+from ..description.cloths import Cloths
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
 from ..errors import InputError, finite_array, integer, real
@@ -71,7 +72,7 @@ class Trajectory:
     ``simulator.steps_done = trajectory.steps_done``.
     """
 
-    cloth: Cloth
+    cloth: Cloth | Cloths
     step: float
     """Time from frame to frame [s]."""
     position: np.ndarray
@@ -146,6 +147,8 @@ class Trajectory:
     def save(self, path: str | os.PathLike) -> None:
         """Writes an .npz file with the cloth, its scene and every frame; it appears whole or not at all."""
         cloth = self.cloth
+        if isinstance(cloth, Cloths):
+            raise InputError("a recording of several cloths cannot be saved yet; write_usd can")
         yarns = np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns])
         colors = np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns])
         numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}

@@ -13,7 +13,7 @@ from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from ..device.graphs import GraphCache
 from ..device.model import Model
 from ..errors import InputError
-from ..kernels.core.status import GAINED
+from ..kernels.core.status import CROWDED, GAINED, IMPACT
 from .checks import LARGEST
 from .frames import Frames
 from .state import State
@@ -195,15 +195,39 @@ class Stepper:
         status = self.arrays["status"].numpy()
         return int(status[2]) - 1 - first if status[0] else steps
 
+    def _status(self) -> int:
+        """Reads what went wrong, or 0."""
+        return int(self.arrays["status"].numpy()[0])
+
+    def make_room(self) -> None:
+        """Makes room for more nodes near each, and captures anew: what was captured has the arrays of before."""
+        with ALONE:
+            self.model.contact.make_room()
+        self.integrator.forget_graphs()
+        self.substepping.forget_graphs()
+        self.arrays.put("status", 0, 0, 0)
+
+    def _make_room(self, frame: int) -> None:
+        """Makes room, and goes back to a frame."""
+        self.make_room()
+        self.frames.restore(frame)
+        self._count(frame)
+
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
         ledger = {name: self.arrays[name].numpy().copy() for name in LEDGER if name in self.arrays}
         parts = self.substepping
         self._step_in_parts = _StepInParts(frame, parts.counts, ledger)
         gained, damped, whole = False, parts.damped, parts.allowed is None
+        while whole and self._status() == CROWDED:
+            self._make_room(frame)
+            self.integrator.advance()
+            if not self._status():
+                self._step_in_parts = None
+                return True
         if whole:
             # it could not be made at once
-            gained = parts.can_damp and int(self.arrays["status"].numpy()[0]) == GAINED
+            gained = parts.can_damp and self._status() in (GAINED, IMPACT)
             self.frames.restore(frame)
             self.arrays.put("status", 0, 0, 0)
             parts.next_size = 1.0 if gained else 0.5

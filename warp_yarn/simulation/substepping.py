@@ -13,7 +13,7 @@ from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE
 from ..device.graphs import GraphCache
 from ..device.model import Model
-from ..kernels.core.status import GAINED, INACCURATE
+from ..kernels.core.status import GAINED, IMPACT, INACCURATE
 from ..moved import renamed, renamed_attribute
 
 SMALLEST = 2.0**-7
@@ -67,6 +67,12 @@ class Substepping:
     def counts(self, counts: tuple[float, int, int, int]) -> None:
         self.next_size, self.accepted, self.rejected, self.damped = counts
 
+    def forget_graphs(self) -> None:
+        """Captures anew, after arrays have changed their place."""
+        self._graphs.clear()
+        if self._fallback is not None:
+            self._fallback.forget_graphs()
+
     def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
 
@@ -117,10 +123,11 @@ class Substepping:
         return self._status() == 0
 
     def _is_to_damp(self, gained: bool, least: float) -> bool:
-        """Tells whether the fallback is to make the part: it gains energy, or could not be made and is the smallest."""
+        """Tells whether the fallback is to make the part: it gains energy, has an impact, or could not be made
+        and is the smallest."""
         if not self.can_damp or self._status() == INACCURATE:
             return False
-        return gained or self._status() == GAINED or self.next_size < least
+        return gained or self._status() in (GAINED, IMPACT) or self.next_size < least
 
     def _damp(self, count: Callable[[], None], size: float, left: float, *, last: bool) -> bool:
         """Makes a part by the fallback, and says whether it is good. The last resort, which cannot be halved, may gain
