@@ -51,8 +51,9 @@ def define(variant: Variant) -> SimpleNamespace:
     def list_near(
         grid: wp.uint64,
         pairs: Pairs,
-        near_reach: wp.array(dtype=scalar),
-        folds_from: wp.array(dtype=scalar),
+        self_contact_distance: wp.array(dtype=scalar),
+        self_contact_range: wp.array(dtype=scalar),
+        near_margin: wp.array(dtype=scalar),
         rest_place: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         near_position: wp.array(dtype=vec3),
@@ -69,8 +70,10 @@ def define(variant: Variant) -> SimpleNamespace:
         for k in range(i * pairs.near_room, (i + 1) * pairs.near_room):
             pairs.near_block[k] = sym33()
         count = int(0)
-        reach = near_reach[0]
-        apart = folds_from[0] * folds_from[0]
+        touch = self_contact_distance[0] + self_contact_range[0]
+        reach = touch + near_margin[0]
+        # the arc of a fold of two layers
+        apart = scalar(wp.static(0.25 * wp.PI * wp.PI)) * touch * touch
         for j in wp.hash_grid_query(grid, x, reach):
             du = rest_place[2 * j] - u
             dv = rest_place[2 * j + 1] - v

@@ -40,7 +40,9 @@ class Obstacle(Fixed):
     path: np.ndarray | None
     friction: float
 
-    def _place(self, size: Sequence[float], position: np.ndarray, rotation: np.ndarray, friction: Any, path: Any):
+    def _place(
+        self, size: Sequence[float] | np.ndarray, position: np.ndarray, rotation: np.ndarray, friction: Any, path: Any
+    ):
         """Takes what all obstacles have; the arguments of each are fixed by itself."""
         self.size = np.array(size, dtype=np.float64)
         self.position, self.rotation = position, rotation
@@ -61,7 +63,8 @@ class Obstacle(Fixed):
         """Whether another one is of the same shape, size, pose, path and friction."""
         mine, its = vars(self), vars(other)
         names = (mine.keys() | its.keys()) - {"_arguments"}
-        return type(self) is type(other) and all(np.array_equal(mine.get(name), its.get(name)) for name in names)
+        pairs = [(np.asarray(mine.get(name)), np.asarray(its.get(name))) for name in names]
+        return type(self) is type(other) and all(np.array_equal(a, b) for a, b in pairs)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(friction {self.friction:g}{', moving' if self.path is not None else ''})"
@@ -227,7 +230,7 @@ class TriangleMesh(Obstacle):
         except ModuleNotFoundError as error:
             raise InputError("reading meshes needs trimesh: pip install trimesh") from error
         try:
-            mesh = trimesh.load(file, force="mesh", process=False)
+            mesh: Any = trimesh.load(str(file), force="mesh", process=False)
             return cls(scale * np.asarray(mesh.vertices), np.asarray(mesh.faces), **options)
         except InputError:
             raise
