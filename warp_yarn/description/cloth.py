@@ -225,7 +225,7 @@ class Cloth(Fixed):
         return self.weave.columns
 
     def place(self, node: int) -> str:
-        """Where a node is, in words."""
+        """Tells where a node is, in words."""
         row, column = divmod(int(node), self.weave.columns)
         return f"row {row}, column {column}"
 

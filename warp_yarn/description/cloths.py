@@ -68,7 +68,7 @@ class Cloths(Fixed):
         return f"Cloths({', '.join(map(repr, self.cloths))})"
 
     def same_as(self, other: Cloth | Cloths) -> bool:
-        """Whether another one is made of the same cloths, in the same order."""
+        """Tells whether another one is made of the same cloths, in the same order."""
         return (
             isinstance(other, Cloths)
             and len(self.cloths) == len(other.cloths)
@@ -90,24 +90,24 @@ class Cloths(Fixed):
         return np.concatenate([cloth.stretch_stiffness for cloth in self.cloths])
 
     def node(self, cloth: int, row: int, column: int) -> int:
-        """Index of a node of one of the cloths; negative rows and columns count from the end."""
+        """Gives the index of a node of one of the cloths; negative rows and columns count from the end."""
         if not isinstance(cloth, int | np.integer) or not 0 <= cloth < len(self.cloths):
             raise InputError(f"cloth = {cloth!r}, must be from 0 to {len(self.cloths) - 1}")
         return int(self.first_node[cloth]) + self.cloths[cloth].node(row, column)
 
     def nodes_of(self, cloth: int) -> slice:
-        """Where the nodes of one of the cloths stand in arrays of nodes."""
+        """Tells where the nodes of one of the cloths stand in arrays of nodes."""
         first = self.node(cloth, 0, 0)
         return slice(first, first + self.cloths[cloth].nodes)
 
     def place(self, node: int) -> str:
-        """Where a node is, in words."""
+        """Tells where a node is, in words."""
         k = int(np.searchsorted(self.first_node, node, side="right")) - 1
         return f"cloth {k}, {self.cloths[k].place(node - int(self.first_node[k]))}"
 
 
 def as_one(cloth: Cloth | Cloths | Sequence[Cloth]) -> Cloth | Cloths:
-    """What a scene is made of: a cloth, or several."""
+    """Gives what a scene is made of: a cloth, or several."""
     if isinstance(cloth, Cloth | Cloths):
         return cloth
     if isinstance(cloth, Sequence) and len(cloth) == 1 and isinstance(cloth[0], Cloth):

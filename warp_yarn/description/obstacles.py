@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, number
+from ..errors import InputError, choice, finite_array, real
 from .cloth import Fixed
 
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
@@ -42,11 +42,11 @@ class Obstacle(Fixed):
 
     def _place(
         self, size: Sequence[float] | np.ndarray, position: np.ndarray, rotation: np.ndarray, friction: Any, path: Any
-    ):
+    ) -> None:
         """Takes what all obstacles have; the arguments of each are fixed by itself."""
         self.size = np.array(size, dtype=np.float64)
         self.position, self.rotation = position, rotation
-        self.friction = number("friction", friction, least=0.0)
+        self.friction = real("friction", friction, least=0.0)
         self.path = None if path is None else self._poses(path)
 
     def _poses(self, path: Any) -> np.ndarray:
@@ -60,7 +60,7 @@ class Obstacle(Fixed):
         return poses
 
     def same_as(self, other: Obstacle) -> bool:
-        """Whether another one is of the same shape, size, pose, path and friction."""
+        """Tells whether another one is of the same shape, size, pose, path and friction."""
         mine, its = vars(self), vars(other)
         names = (mine.keys() | its.keys()) - {"_arguments"}
         pairs = [(np.asarray(mine.get(name)), np.asarray(its.get(name))) for name in names]
@@ -101,7 +101,7 @@ class Sphere(Obstacle):
     shape = "sphere"
 
     def __init__(self, *, center: Any, radius: float, friction: float = 0.3, path: Any = None):
-        radius = number("radius", radius, above=0.0)
+        radius = real("radius", radius, above=0.0)
         center = finite_array("center", center, (3,))
         self._place((radius, 0.0, 0.0), center, np.array(UNTURNED), friction, path)
         self._fix(center=center, radius=radius, friction=self.friction, path=self.path)
@@ -112,7 +112,7 @@ class _Rod(Obstacle):
 
     def __init__(self, *, start: Any, end: Any, radius: float, friction: float = 0.3, path: Any = None):
         start, end = finite_array("start", start, (3,)), finite_array("end", end, (3,))
-        radius = number("radius", radius, above=0.0)
+        radius = real("radius", radius, above=0.0)
         along = _direction("end - start", end - start)
         half = 0.5 * float(np.linalg.norm(end - start))
         self._place((half, radius, 0.0), 0.5 * (start + end), _turn_z_to(along), friction, path)
@@ -160,7 +160,7 @@ class Box(Obstacle):
     ):
         half = finite_array("half_extents", half_extents, (3,))
         for k, value in enumerate(half):
-            number(f"half_extents[{k}]", value, above=0.0)
+            real(f"half_extents[{k}]", value, above=0.0)
         center, rotation = finite_array("center", center, (3,)), unit_quaternion("rotation", rotation)
         self._place(half, center, rotation, friction, path)
         self._fix(center=center, half_extents=half, rotation=rotation, friction=self.friction, path=self.path)
@@ -224,7 +224,7 @@ class TriangleMesh(Obstacle):
         Raises:
             InputError: no trimesh, or a file without triangles.
         """
-        scale = number("scale", scale, above=0.0)
+        scale = real("scale", scale, above=0.0)
         try:
             import trimesh
         except ModuleNotFoundError as error:
@@ -270,7 +270,7 @@ class Contact(Fixed):
         samples: str = "nodes",
     ):
         def optional(name: str, value: Any) -> float | None:
-            return None if value is None else number(name, value, above=0.0)
+            return None if value is None else real(name, value, above=0.0)
 
         self.method = choice("contact method", method, METHODS)
         self.stiffness = optional("contact stiffness", stiffness)
@@ -278,8 +278,8 @@ class Contact(Fixed):
         self.range = optional("contact range", range)
         self.self_distance = optional("contact self_distance", self_distance)
         self.self_range = optional("contact self_range", self_range)
-        self.friction = number("contact friction", friction, least=0.0)
-        self.slip_speed = number("contact slip_speed", slip_speed, above=0.0)
+        self.friction = real("contact friction", friction, least=0.0)
+        self.slip_speed = real("contact slip_speed", slip_speed, above=0.0)
         self.damping_speed = optional("contact damping_speed", damping_speed)
         self.samples = choice("contact samples", samples, SAMPLES)
         self._fix(**vars(self))
@@ -292,7 +292,7 @@ class Contact(Fixed):
 
 
 def unit_quaternion(name: str, value: Any) -> np.ndarray:
-    """A rotation, of length 1, or an InputError."""
+    """Gives a rotation, of length 1, or an InputError."""
     q = finite_array(name, value, (4,))
     length = float(np.linalg.norm(q))
     if abs(length - 1.0) > 1e-6:
@@ -309,7 +309,7 @@ def _direction(name: str, value: Any) -> np.ndarray:
 
 
 def _turn_z_to(n: np.ndarray) -> np.ndarray:
-    """The shortest rotation that turns z into a unit vector, as a quaternion."""
+    """Finds the shortest rotation that turns z into a unit vector, as a quaternion."""
     if n[2] < -1.0 + 1e-12:
         return np.array([1.0, 0.0, 0.0, 0.0])
     q = np.array([-n[1], n[0], 0.0, 1.0 + n[2]])

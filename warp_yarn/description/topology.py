@@ -53,7 +53,7 @@ class Topology:
 
 
 def side_by_side(parts: Sequence[Topology]) -> Topology:
-    """Several cloths as one, their nodes and yarns numbered on from one to the next."""
+    """Joins several cloths to one, their nodes and yarns numbered on from one to the next."""
     nodes = np.cumsum([0, *(part.nodes for part in parts)])
     yarns = np.cumsum([0, *(len(part.yarn_direction) for part in parts)])
     # no place in the weave is that of two nodes

@@ -21,6 +21,9 @@ SPEED = 3.0
 """Of a node whose kinetic energy the default stiffness stops within its range [m/s]: fabric that falls or is thrown."""
 NEAR_MARGIN = 0.5
 """Of the list of nodes that are near, in spacings: how far nodes may move relative to each other before a new one."""
+OBSTACLE_PATHS = ("obstacle_position_path", "obstacle_rotation_path")
+PLACED = ("obstacle_position", "obstacle_rotation", "obstacle_velocity", "obstacle_spin")
+"""Arrays that follow from the paths at the time of a stage."""
 NEAR_ROOM = 32
 """Nodes near each that there is room for at first."""
 
@@ -137,6 +140,7 @@ class Contact:
         self.obstacles, self.self_contact = bool(scene.obstacles), scene.self_contact
         self.on = self.obstacles or self.self_contact
         self.obstacles_move = "obstacles move" in model.arrays.conditions
+        self._tapes: dict[int, wp.Tape] = {}
         self._has_mesh = any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
         if self.self_contact:
             a, cloth = model.arrays, scene.cloth
@@ -218,6 +222,15 @@ class Contact:
 
     def _place(self, stage: int) -> None:
         self.model.launch("place_obstacles", "obstacles", stage=stage, step_duration=self.model.step_size)
+
+    def scatter_gradient(self, stage: int) -> None:
+        """Reverse ``load`` of obstacles: what a stage gave to where they were goes to the rows of their paths."""
+        if stage not in self._tapes:
+            self._tapes[stage] = wp.Tape()
+            with self._tapes[stage]:
+                self._place(stage)
+        self._tapes[stage].backward()
+        self.model.arrays.zero_grad(*PLACED)
 
     def add_power(self) -> None:
         """Add the power of moving obstacles to ``power``."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..device import declarations
 from ..device.arrays import STATE_TYPES
+from ..device.contact import OBSTACLE_PATHS, PLACED
 from ..device.declared import arrays_of
 from ..device.inputs import PATHS
 from ..errors import GradientError, InputError
@@ -37,6 +38,9 @@ class Adjoint:
         self.moving = [name for name in PATHS if name in parameters and f"{name}_path" in a]
         self.wanted = (*STATE_TYPES, *parameters, *(f"{name}_path" for name in self.moving))
         a.require_grad(*self.wanted)
+        self.places = any(name in parameters for name in OBSTACLE_PATHS)
+        if self.places:
+            a.require_grad(*PLACED)
         # (u, v) has one even where it does not change: it may be an input
         a.make(declarations.LOSS)
         self._prepared: list[Any] = []
@@ -57,6 +61,8 @@ class Adjoint:
         """Adds what a stage gave to inputs that change from step to step to the rows of their paths."""
         for name in self.moving:
             self.simulator.model.inputs.scatter_gradient(name, stage)
+        if self.places:
+            self.simulator.model.contact.scatter_gradient(stage)
 
     def release(self) -> None:
         """Gives the gradients of parameters up, before another one asks for other parameters."""
@@ -66,7 +72,7 @@ class Adjoint:
 
     def clear(self) -> None:
         """Sets every gradient that a run adds to back to 0."""
-        self.arrays.zero_grad(*self.wanted)
+        self.arrays.zero_grad(*self.wanted, *(PLACED if self.places else ()))
 
     def backward_chunk(self, first: int, steps: int, before: int = 0) -> None:
         """Goes back over the steps of a chunk whose frames are on the device, to the chunk's first frame.

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..description.obstacles import unit_quaternion
 from ..errors import InputError, real
 from ..kernels import TERMS, own, parameters
 from ..simulation.simulator import Simulator
@@ -59,6 +60,7 @@ class Inputs:
                 values[name] = path[:-1] if name == "forces" else path
             elif array in arrays:
                 values[name] = arrays[array].numpy()
+        values |= {name: arrays[name].numpy().reshape(shape) for name, shape in obstacle_shapes(simulator).items()}
         state = simulator.state
         values |= {name: getattr(state, name) for name in FIELDS}
         return {name: torch.tensor(value, dtype=self.dtype, device=self.device) for name, value in values.items()}
@@ -115,8 +117,22 @@ class Inputs:
         if allowed_range(name):
             at = int(tensor.argmin())
             real(f"{name}[{at}]" if tensor.ndim else name, tensor.reshape(-1)[at].item(), **allowed_range(name))
+        if "obstacle_rotation" in name:
+            for k, q in enumerate(tensor.detach().reshape(-1, 4)):
+                unit_quaternion(f"{name}[{k}]", q.numpy(force=True))
         # Whoever changes theirs in place before the backward pass shall not change this run's.
         return tensor.clone()
+
+
+def obstacle_shapes(simulator: Simulator) -> dict[str, tuple[int, ...]]:
+    """Lists the inputs that say where obstacles are and what they are like, with their shapes."""
+    count = len(simulator.scene.obstacles)
+    if not count:
+        return {}
+    shapes: dict[str, tuple[int, ...]] = {"obstacle_size": (count, 3), "obstacle_friction": (count,)}
+    rest = (-1, count) if simulator.model.contact.obstacles_move else (count,)
+    end = "_path" if simulator.model.contact.obstacles_move else ""
+    return {**shapes, f"obstacle_position{end}": (*rest, 3), f"obstacle_rotation{end}": (*rest, 4)}
 
 
 def array_of(name: str, value: torch.Tensor) -> str:
@@ -127,6 +143,8 @@ def array_of(name: str, value: torch.Tensor) -> str:
 
 def allowed_range(name: str) -> dict[str, float]:
     """Says what ``number`` is to check of an input."""
+    if name in ("obstacle_size", "obstacle_friction"):
+        return {"least": 0.0}
     parameter = parameters().get(name.removeprefix("yarn_"))
     return {} if parameter is None else parameter.range
 

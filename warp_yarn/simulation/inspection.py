@@ -105,7 +105,9 @@ class Inspection:
         contact, place = self.model.contact, self.model.scene.cloth.place
         with _Visit(self.stepper, state):
             found = [self._near_pairs()] if contact.self_contact else []
-            found += [contact.near_obstacles()] if contact.obstacles else []
+            # of a state that is set, the time is not known yet by which obstacles move
+            where_known = state is None or not contact.obstacles_move
+            found += [contact.near_obstacles()] if contact.obstacles and where_known else []
         for near in found:
             if not len(near.gap):
                 continue
