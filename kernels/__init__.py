@@ -9,7 +9,7 @@ import functools
 
 import warp as wp
 
-from .contact import broad_phase, limits, obstacles, self_contact
+from .contact import broad_phase, limits, meshes, obstacles, self_contact
 from .core.variant import Term, TermParameter, Variant
 from .linear import (
     block_matrix,
@@ -49,6 +49,7 @@ _OWN = (
     pins.TERM,
     applied_force.TERM,
     obstacles.TERM,
+    meshes.TERM,
     self_contact.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
@@ -123,7 +124,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
     kernels |= vars(limits.define_motion(variant))
-    for reports in (obstacles.define_reports, self_contact.define_limits):
+    for reports in (obstacles.define_reports, meshes.define_search, self_contact.define_limits):
         kernels |= vars(reports(variant.forward))
     for part in (
         linear,

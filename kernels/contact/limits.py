@@ -19,6 +19,7 @@ from ..core.status import IMPACT, OVERLAPPING, fail
 from ..core.structs import structs
 from ..core.variant import Variant
 from ..linear.pair_blocks import IMPACTS, TOUCHES
+from . import meshes as mesh_contact
 from . import obstacles
 from .distances import MESH
 
@@ -32,28 +33,36 @@ PLACES = 24
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
     to_obstacle = obstacles.functions(variant).to_obstacle
-    Obstacles = structs(variant).Obstacles
+    Obstacles, Faces = structs(variant).Obstacles, structs(variant).Faces
+    vec4, to_face = variant.vec4, mesh_contact.functions(variant).to_face
     module = variant.module("contact_limits")
 
     @wp.func
-    def nearest_face(obstacles: Obstacles, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3) -> int:
-        """Find the face of a mesh that is closest to x: the search tree is in single precision, distances are not."""
+    def nearest(obstacles: Obstacles, faces: Faces, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3) -> vec4:
+        """Find (n, g) of a place and an obstacle; of a mesh that of its closest face: the search tree is in single
+        precision, distances are not."""
         if obstacles.obstacle_shape[k] != wp.static(MESH):
-            return 0
+            return to_obstacle(obstacles, k, x)
         local = wp.quat_rotate_inv(obstacles.obstacle_rotation[k], x - obstacles.obstacle_position[k])
         place = wp.vec3(float(local[0]), float(local[1]), float(local[2]))
         found = wp.mesh_query_point_no_sign(meshes[k], place, wp.static(1.0e10))
-        return obstacles.first_face[k] + found.face
+        return to_face(obstacles, faces, obstacles.first_face[k] + found.face, x)
 
     @wp.func
     def reach(
-        obstacles: Obstacles, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3, move: vec3, limit: scalar
+        obstacles: Obstacles,
+        faces: Faces,
+        meshes: wp.array(dtype=wp.uint64),
+        k: int,
+        x: vec3,
+        move: vec3,
+        limit: scalar,
     ) -> scalar:
         """Find the part of a move, 1 at most, before which φ stays above the limit."""
         gone = scalar(0.0)
         for _ in range(wp.static(PLACES)):
             place = x + move * gone
-            at = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, place), place)
+            at = nearest(obstacles, faces, meshes, k, place)
             room = at[3] - limit
             approach = -(at[0] * move[0] + at[1] * move[1] + at[2] * move[2])
             if obstacles.obstacle_shape[k] == wp.static(MESH):
@@ -67,20 +76,9 @@ def define(variant: Variant) -> SimpleNamespace:
         return wp.min(gone, scalar(1.0))
 
     @wp.kernel(module=module, enable_backward=False)
-    def find_faces(
-        obstacles: Obstacles,
-        meshes: wp.array(dtype=wp.uint64),
-        position: wp.array(dtype=vec3),
-        mesh_face: wp.array(dtype=int),
-    ):
-        """Find the face of each mesh that each node is closest to."""
-        e = index(wp.tid())
-        count = obstacles.obstacle_shape.shape[0]
-        mesh_face[e] = nearest_face(obstacles, meshes, e % count, position[e / count])
-
-    @wp.kernel(module=module, enable_backward=False)
     def limit_to_obstacles(
         obstacles: Obstacles,
+        faces: Faces,
         meshes: wp.array(dtype=wp.uint64),
         contact_distance: wp.array(dtype=scalar),
         stage_size: wp.array(dtype=scalar),
@@ -96,18 +94,19 @@ def define(variant: Variant) -> SimpleNamespace:
         k = index(e % count)
         x = position[i]
         if is_free[i] != 0:
-            gap = to_obstacle(obstacles, k, obstacles.mesh_face[e], x)[3]
+            gap = nearest(obstacles, faces, meshes, k, x)[3]
             limit = contact_distance[0] + scalar(wp.static(LEFT)) * (gap - contact_distance[0])
             move = direction[i] * stage_size[0]
             # most are far away
             if gap - wp.length(move) < limit:
-                part = reach(obstacles, meshes, k, x, move, limit)
+                part = reach(obstacles, faces, meshes, k, x, move, limit)
                 if part < scalar(1.0):
                     wp.atomic_min(step_length, 0, part)
 
     @wp.kernel(module=module, enable_backward=False)
     def start_outside(
         obstacles: Obstacles,
+        faces: Faces,
         meshes: wp.array(dtype=wp.uint64),
         obstacle_position_before: wp.array(dtype=vec3),
         obstacle_rotation_before: wp.array(dtype=quat),
@@ -126,28 +125,28 @@ def define(variant: Variant) -> SimpleNamespace:
         distance = contact_distance[0]
         x = position[i]
         for k in range(count):
-            now = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, x), x)[3]
+            now = nearest(obstacles, faces, meshes, k, x)[3]
             arm = position[i] - obstacle_position_before[k]
             local = wp.quat_rotate_inv(obstacle_rotation_before[k], arm)
             taken = obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
-            before = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, taken), taken)[3]
+            before = nearest(obstacles, faces, meshes, k, taken)[3]
             if now < distance + scalar(0.5) * (before - distance):
                 x = taken
         move = base_position[i] + solution[i] * stage_size[0] - x
         part = scalar(1.0)
         inside = int(0)
         for k in range(count):
-            gap = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, x), x)[3]
+            gap = nearest(obstacles, faces, meshes, k, x)[3]
             if not (gap > distance):
                 inside = int(1)
             limit = distance + scalar(wp.static(LEFT)) * (gap - distance)
-            part = wp.min(part, reach(obstacles, meshes, k, x, move, limit))
+            part = wp.min(part, reach(obstacles, faces, meshes, k, x, move, limit))
         if is_free[i] == 0:
             # what is held goes where it is sent; there it may not be inside
             inside = int(0)
             end = base_position[i] + solution[i] * stage_size[0]
             for k in range(count):
-                if to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, end), end)[3] <= distance:
+                if nearest(obstacles, faces, meshes, k, end)[3] <= distance:
                     inside = int(1)
         elif part < scalar(1.0) or wp.length_sq(x - position[i]) > scalar(0.0):
             solution[i] = (x + move * part - base_position[i]) / stage_size[0]
@@ -175,7 +174,6 @@ def define(variant: Variant) -> SimpleNamespace:
         refuse_impact=refuse_impact,
         ask_where_touching=ask_where_touching,
         copy_rotations=copy_rotations,
-        find_faces=find_faces,
         limit_to_obstacles=limit_to_obstacles,
         start_outside=start_outside,
     )

@@ -136,8 +136,7 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class Obstacles:
-        """Of each obstacle: shape, size, friction, pose, velocity ṗ and spin ω. Of a mesh: the first of its faces among
-        ``mesh_corner``, three to a face; and of each node and mesh the face to take the closest point from."""
+        """Of each obstacle: shape, size, friction, pose, velocity ṗ and spin ω; of a mesh the first of its faces."""
 
         obstacle_shape: wp.array(dtype=int)
         obstacle_size: wp.array(dtype=vec3)
@@ -147,12 +146,22 @@ def structs(variant: Variant) -> SimpleNamespace:
         obstacle_velocity: wp.array(dtype=vec3)
         obstacle_spin: wp.array(dtype=vec3)
         first_face: wp.array(dtype=int)
+
+    @wp.struct
+    class Faces:
+        """Of each face of all meshes three corners and its obstacle; of each node ``face_room`` places, of which
+        ``face_count`` are taken by faces that are near."""
+
+        face_room: int
         mesh_corner: wp.array(dtype=vec3)
-        mesh_face: wp.array(dtype=int)
+        face_obstacle: wp.array(dtype=int)
+        face_count: wp.array(dtype=int)
+        near_face: wp.array(dtype=int)
 
     return SimpleNamespace(
         Pairs=Pairs,
         Obstacles=Obstacles,
+        Faces=Faces,
         BlockMatrix=BlockMatrix,
         SolverWork=SolverWork,
         SolveReport=SolveReport,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -83,16 +84,18 @@ class Inspection:
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
             if contact.obstacles:
                 found.append(contact.near_obstacles())
+            if contact.has_mesh:
+                found.append(self._with_room(contact.near_faces))
             if contact.self_contact:
-                found.append(self._near_pairs())
+                found.append(self._with_room(contact.near_pairs))
         return contacts_of(found, position)
 
-    def _near_pairs(self) -> Near:
-        """Reports the nodes that are near each other, with room for all of them."""
-        found = self.model.contact.near_pairs()
+    def _with_room(self, report: Callable[[], Near]) -> Near:
+        """Reports what is near, with room for all of it."""
+        found = report()
         while int(self.model.arrays["status"].numpy()[0]) == CROWDED:
             self.stepper.make_room()
-            found = self.model.contact.near_pairs()
+            found = report()
         return found
 
     @alone
@@ -104,10 +107,13 @@ class Inspection:
         """
         contact, place = self.model.contact, self.model.scene.cloth.place
         with _Visit(self.stepper, state):
-            found = [self._near_pairs()] if contact.self_contact else []
+            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move
             where_known = state is None or not contact.obstacles_move
-            found += [contact.near_obstacles()] if contact.obstacles and where_known else []
+            if where_known and contact.obstacles:
+                found.append(contact.near_obstacles())
+            if where_known and contact.has_mesh:
+                found.append(self._with_room(contact.near_faces))
         for near in found:
             if not len(near.gap):
                 continue
