@@ -156,6 +156,7 @@ class Inspection:
         """
         h = self.model.step_size
         with _Visit(self.stepper, state, ahead=True):
+            self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return read_system(self.model)
