@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 
 from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
+from ..description.obstacles import Box, Capsule, Contact, Cylinder, Obstacle, Plane, Sphere, TriangleMesh
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
-from ..errors import InputError, finite_array, number, whole
+from ..errors import InputError, choice, finite_array, number, whole
 from ..io.files import whole_file
 
-FORMAT = 2
-"""Of recordings: 1 had no number, no scene and no count of steps."""
+FORMAT = 3
+"""Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles and no contact."""
+
+SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
 
 @dataclasses.dataclass(eq=False)
@@ -221,7 +224,13 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
         "force_nodes": scene.force_nodes,
         **{f"force_{node}": force for node, force in scene.forces.items()},
+        "self_contact": scene.self_contact,
+        # None is a value of its own there, not always the default
+        **{f"contact_{name}": np.nan if value is None else value for name, value in scene.contact._arguments.items()},
+        "obstacles": np.array([obstacle.shape for obstacle in scene.obstacles], dtype=str),
     }
+    for k, obstacle in enumerate(scene.obstacles):
+        values.update({f"obstacle_{k}_{name}": value for name, value in obstacle._arguments.items()})
     return {f"scene_{name}": value for name, value in values.items() if value is not None}
 
 
@@ -243,4 +252,24 @@ def _unpacked(cloth: Cloth, data: Any) -> Scene:
         sliding=value("sliding").item(),
         terms=value("terms").tolist(),
         published_scaling=value("published_scaling").item(),
+        obstacles=_unpacked_obstacles(data),
+        self_contact="scene_self_contact" in data and value("self_contact").item(),
+        contact=Contact(**_arguments(data, "contact")),
     )
+
+
+def _unpacked_obstacles(data: Any) -> list[Obstacle]:
+    """In recordings of before there are none."""
+    shapes = data["scene_obstacles"].tolist() if "scene_obstacles" in data else []
+    return [
+        SHAPES[choice("obstacles", shape, SHAPES)](**_arguments(data, f"obstacle_{k}"))
+        for k, shape in enumerate(shapes)
+    ]
+
+
+def _arguments(data: Any, group: str) -> dict[str, Any]:
+    """What something was made of: arrays, and numbers and names as such; NaN is None."""
+    start = f"scene_{group}_"
+    found = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+    values = {name: array if array.ndim else array.item() for name, array in found.items()}
+    return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}
