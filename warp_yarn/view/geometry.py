@@ -27,6 +27,9 @@ OBSTACLE_COLOR = (0.62, 0.60, 0.57)
 PLANE_MARGIN = 1.3
 """Side of the square that stands for a plane, over that of what is drawn above it."""
 
+BACK = np.array([-1.0, -1.0, -1.0, 1.0])
+"""Times a quaternion (x, y, z, w): what turns back."""
+
 CATMULL_ROM = 0.5 * np.array(
     [[0.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [2.0, -5.0, 4.0, -1.0], [-1.0, 3.0, -3.0, 1.0]]
 )
@@ -150,6 +153,10 @@ class Placed:
         """Points of the obstacle's own frame [points, 3] at every frame [frames, points, 3]."""
         return self.position[:, None] + _turned(self.rotation[:, None], points[None])
 
+    def local(self, points: np.ndarray, frame: int) -> np.ndarray:
+        """Places [points, 3] in the obstacle's own frame."""
+        return _turned(self.rotation[frame] * BACK, points - self.position[frame])
+
     def matrix(self, frame: int) -> np.ndarray:
         """[4, 4]: from its own frame to the world."""
         result = np.eye(4)
@@ -194,7 +201,7 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
         side = 0.0
         if obstacle.shape == "plane":
             # a square of its own, which moves as it does, under all of the cloth at all times
-            local = _turned(rotation[:, None] * [-1.0, -1.0, -1.0, 1.0], points - position[:, None])[..., :2]
+            local = _turned(rotation[:, None] * BACK, points - position[:, None])[..., :2]
             low, high = local.min(axis=(0, 1)), local.max(axis=(0, 1))
             side = PLANE_MARGIN * float((high - low).max())
             position = position + _turned(rotation, np.append(0.5 * (low + high), 0.0))

@@ -1,0 +1,75 @@
+"""A tray is pulled away under a cloth: slowly, and the cloth goes along; fast, and it stays, and falls.
+
+python scenes/pull.py                                     at 20 m/s² up to 1 m/s: out/pull.usdc
+python scenes/pull.py --acceleration 1 --speed 0.05       the cloth rides along
+python scenes/pull.py --friction 0.1 --weave satin --png out/pull.png
+
+Friction cannot accelerate the cloth by more than μ g. Below the tray is a floor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+import touch
+from common import command, read_number
+
+import warp_yarn as wy
+
+GRAVITY = 9.8
+
+
+def parser() -> argparse.ArgumentParser:
+    result = touch.parser(__doc__, "pull", rows=17, columns=17, steps=150)
+    for name, value, text in (("--acceleration", 20.0, "of the tray [m/s²]"), ("--speed", 1.0, "its last [m/s]")):
+
+        def positive(typed: str, name: str = name) -> float:
+            return read_number(name, typed, above=0.0)
+
+        result.add_argument(name, type=positive, default=value, help=f"{text} (%(default)g)")
+    return result
+
+
+def way(acceleration: float, speed: float, time: np.ndarray) -> np.ndarray:
+    """How far the tray has moved [m]: steadily faster, then steadily."""
+    until = speed / acceleration
+    return np.where(time < until, 0.5 * acceleration * time**2, speed * (time - 0.5 * until))
+
+
+def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
+    """Simulates, writes, and tells what was made.
+
+    Raises:
+        InputError: an option that cannot be used.
+        SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
+    """
+    options = touch.parsed(parser(), arguments)
+    cloth = touch.flat(options, height=0.0)
+    length = float(np.ptp(cloth.position, axis=0).max())
+    half = np.array([0.55, 0.55, 0.04]) * length
+    high = 0.35 * length
+    cloth = cloth.replace(pose=cloth.position + [0.0, 0.0, high + touch.rest(cloth)])
+    center = np.array([0.0, 0.0, high - half[2]])
+    moved = way(options.acceleration, options.speed, options.step * np.arange(1, options.steps + 1))
+    tray = wy.Box(
+        center=center, half_extents=half, friction=options.friction, path=center + moved[:, None] * [0.0, 1.0, 0.0]
+    )
+    floor = wy.Plane(point=(0, 0, 0), normal=(0, 0, 1), friction=options.friction)
+    made = touch.run(touch.scene(cloth, options, obstacles=[floor, tray]), options)
+    return touch.finish(made, options, shares(made.trajectory, moved, options))
+
+
+def shares(trajectory: wy.Trajectory, moved: np.ndarray, options: argparse.Namespace) -> str:
+    """How far the cloth went with the tray."""
+    went = (trajectory.position[-1] - trajectory.position[0])[:, 1].mean()
+    of = moved[len(trajectory) - 2] if len(trajectory) > 1 else 0.0
+    most = options.friction * GRAVITY
+    asked = f"the tray's {options.acceleration:g} m/s², friction's limit {most:.3g} m/s²"
+    return f"the tray went {1e3 * of:.1f} mm, the cloth {1e3 * went:.1f} mm ({asked})"
+
+
+if __name__ == "__main__":
+    sys.exit(command(main))
