@@ -22,26 +22,28 @@ import warp_yarn as wy
 from warp_yarn.errors import whole
 from warp_yarn.simulation.state import FIELDS
 
+SHORT = 2.0
+"""How far it is let go before the other edge, in spacings: on it, it would slip over."""
 LAYERS = 2.5
 """How far above the other edge the carried one is let go, in spacings: where layers touch, but hardly."""
 
 
 def parser() -> argparse.ArgumentParser:
     result = touch.parser(__doc__, "fold", rows=15, columns=21, steps=200)
-    result.add_argument("--fold", type=int, default=300, metavar="STEPS", help="of the fold, before (%(default)s)")
+    result.add_argument("--fold", type=int, default=600, metavar="STEPS", help="of the fold, before (%(default)s)")
     return result
 
 
 def carried(cloth: wy.Cloth, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The nodes of the left edge, and their way [steps, nodes, 3] (m): over the other edge, in half an ellipse that the
-    cloth is long enough for at all times, fast in its middle and slow at its ends."""
+    """The nodes of the left edge, and their way [steps, nodes, 3] (m): over the other edge, in half an ellipse, fast in
+    its middle and slow at its ends. A higher one would drag the cloth along, a lower one leave it slack, to buckle."""
     rows, columns = cloth.weave.rows, cloth.weave.columns
     pins = np.arange(rows) * columns
     start = cloth.position[pins]
     length = cloth.position[:, 0].max() - cloth.position[:, 0].min()
     angle = 0.5 * np.pi * (1.0 - np.cos(np.pi * np.arange(1, steps + 1) / steps))
-    across = 0.5 * length * (1.0 - np.cos(angle))
-    up = 0.4 * length * np.sin(angle) + LAYERS * cloth.spacing * angle / np.pi
+    across = 0.5 * (length - SHORT * cloth.spacing) * (1.0 - np.cos(angle))
+    up = 0.47 * length * np.sin(angle) + LAYERS * cloth.spacing * angle / np.pi
     way = np.stack([across, np.zeros(steps), up], axis=1)
     return pins, start + way[:, None]
 

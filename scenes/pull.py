@@ -23,7 +23,7 @@ GRAVITY = 9.8
 
 
 def parser() -> argparse.ArgumentParser:
-    result = touch.parser(__doc__, "pull", rows=17, columns=17, steps=150)
+    result = touch.parser(__doc__, "pull", rows=17, columns=17, steps=45)
     for name, value, text in (("--acceleration", 20.0, "of the tray [m/s²]"), ("--speed", 1.0, "its last [m/s]")):
 
         def positive(typed: str, name: str = name) -> float:

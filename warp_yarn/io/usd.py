@@ -42,7 +42,7 @@ def write_usd(
     translation of /cloth, which is in double precision. The file appears whole or not at all; stages of this process
     that have an older one open show the new one.
 
-    Obstacles are of the kind that USD has for their shape, a box a scaled cube, and a plane a square beneath the cloth.
+    Obstacles are of the kind that USD has for their shape, a box a scaled cube, and a plane a rectangle beneath the cloth.
     Those that move have a translation and a rotation for each frame. Their custom data say their shape and friction.
 
     Args:
@@ -150,8 +150,8 @@ def _write_obstacle(stage: Usd.Stage, path: str, placed: Placed) -> None:
         x, y, z, w = placed.rotation[frame].tolist()
         turn.Set(Gf.Quatd(w, x, y, z), *time)
     if obstacle.shape == "plane":
-        shape.CreateWidthAttr(placed.side)
-        shape.CreateLengthAttr(placed.side)
+        shape.CreateWidthAttr(placed.width)
+        shape.CreateLengthAttr(placed.length)
         shape.CreateDoubleSidedAttr(True)
     elif obstacle.shape == "box":
         shape.CreateSizeAttr(2.0)

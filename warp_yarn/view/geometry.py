@@ -24,8 +24,8 @@ PALETTE = ((0.13, 0.56, 0.57), (0.96, 0.49, 0.37), (0.93, 0.75, 0.36), (0.36, 0.
 OBSTACLE_COLOR = (0.62, 0.60, 0.57)
 """Of all obstacles, sRGB: a grey that no yarn has by default."""
 
-PLANE_MARGIN = 1.3
-"""Side of the square that stands for a plane, over that of what is drawn above it."""
+PLANE_MARGIN = 0.15
+"""How far the rectangle that stands for a plane goes beyond what is above it, over the longer side of that."""
 
 BACK = np.array([-1.0, -1.0, -1.0, 1.0])
 """Times a quaternion (x, y, z, w): what turns back."""
@@ -139,11 +139,12 @@ class Placed:
 
     obstacle: Obstacle
     position: np.ndarray
-    """[frames, 3] (m): of its origin; of a plane, the middle of the square that stands for it."""
+    """[frames, 3] (m): of its origin; of a plane, the middle of the rectangle that stands for it."""
     rotation: np.ndarray
     """[frames, 4]: quaternions (x, y, z, w)."""
-    side: float
-    """Of a plane's square [m]; of others 0."""
+    width: float
+    length: float
+    """Along x and y, of a plane's rectangle [m]; of others 0."""
 
     @property
     def moves(self) -> bool:
@@ -165,11 +166,11 @@ class Placed:
         return result
 
     def corners(self) -> np.ndarray:
-        """Of a box around it in its own frame [8, 3] (m); of a plane, of its square [4, 3]."""
+        """Of a box around it in its own frame [8, 3] (m); of a plane, of its rectangle [4, 3]."""
         obstacle = self.obstacle
         low, high = np.zeros(3), np.zeros(3)
         if obstacle.shape == "plane":
-            high[:2] = 0.5 * self.side
+            high[:2] = 0.5 * self.width, 0.5 * self.length
         elif obstacle.shape == "mesh":
             low, high = obstacle.vertices.min(axis=0), obstacle.vertices.max(axis=0)  # type: ignore[attr-defined]
         elif obstacle.shape == "box":
@@ -198,14 +199,14 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
     result = []
     for obstacle in trajectory.scene.obstacles:
         position, rotation = _poses(obstacle, trajectory.start + at)
-        side = 0.0
+        width = length = 0.0
         if obstacle.shape == "plane":
-            # a square of its own, which moves as it does, under all of the cloth at all times
+            # a rectangle of its own, which moves as it does, under all of the cloth at all times
             local = _turned(rotation[:, None] * BACK, points - position[:, None])[..., :2]
             low, high = local.min(axis=(0, 1)), local.max(axis=(0, 1))
-            side = PLANE_MARGIN * float((high - low).max())
+            width, length = (high - low + 2.0 * PLANE_MARGIN * (high - low).max()).tolist()
             position = position + _turned(rotation, np.append(0.5 * (low + high), 0.0))
-        result.append(Placed(obstacle, position, rotation, side))
+        result.append(Placed(obstacle, position, rotation, width, length))
     return result
 
 

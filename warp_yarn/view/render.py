@@ -31,7 +31,7 @@ MARGIN = 1.08
 BACKGROUND = "#dbdee3"
 ROUND = 96
 """Facets around an obstacle that is round."""
-SURROUNDINGS = 0.1
+SURROUNDINGS = 0.15
 """How far about the yarns obstacles are in view, over the largest extent of these: what is beyond may be cut off."""
 OVERSAMPLING = 5.0**0.5
 """Of VTK's anti-aliasing, along either axis."""
@@ -50,7 +50,7 @@ def write_png(
     view: Sequence[float] = VIEW,
 ) -> None:
     """Draws one frame of a trajectory: every yarn a smooth tube in the colour of its material; and the obstacles, of a
-    plane a square beneath the cloth.
+    plane a rectangle beneath the cloth.
 
     Needs ``warp_yarn[render]``. The same picture is the same to the last pixel on one machine. The file appears whole
     or not at all.
@@ -250,7 +250,7 @@ def _surface(pv: Any, placed: Placed) -> Any:
     if isinstance(obstacle, TriangleMesh):
         return pv.PolyData(obstacle.vertices, faces=np.insert(obstacle.faces, 0, 3, axis=1))
     if obstacle.shape == "plane":
-        return pv.Plane(direction=axis, i_size=placed.side, j_size=placed.side)
+        return pv.Plane(direction=axis, i_size=placed.width, j_size=placed.length)
     if obstacle.shape == "box":
         x, y, z = obstacle.size
         return pv.Box((-x, x, -y, y, -z, z))
