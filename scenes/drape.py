@@ -81,9 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
-    cloth = touch.flat(options, height=0.0)
+    cloth = touch.flat(options)
     beneath, height = obstacles(options, float(np.ptp(cloth.position, axis=0).max()))
-    cloth = cloth.replace(pose=cloth.position + [0.0, 0.0, height + touch.rest(cloth)])
+    cloth = touch.raised(cloth, height)
     made = touch.run(touch.scene(cloth, options, obstacles=beneath), options)
     drop = height + touch.rest(cloth) - made.trajectory.position[-1, :, 2].min()
     return touch.finish(made, options, f"it hangs down by {1e3 * drop:.2f} mm")

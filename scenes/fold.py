@@ -64,8 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     options = touch.parsed(parser(), arguments)
     whole("--fold", options.fold, least=1)
     table = [wy.Plane(point=(0, 0, 0), normal=(0, 0, 1), friction=options.friction)]
-    cloth = touch.flat(options, height=0.0)
-    cloth = cloth.replace(pose=cloth.position + [0.0, 0.0, touch.rest(cloth)])
+    cloth = touch.raised(touch.flat(options), 0.0)
     pins, path = carried(cloth, options.fold)
     held = touch.scene(cloth, options, obstacles=table, pins=pins, pin_path=path)
     first = simulate(touch.simulator(held, options), options.fold)

@@ -47,11 +47,11 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
-    cloth = touch.flat(options, height=0.0)
+    cloth = touch.flat(options)
     length = float(np.ptp(cloth.position, axis=0).max())
     half = np.array([0.55, 0.55, 0.04]) * length
     high = 0.35 * length
-    cloth = cloth.replace(pose=cloth.position + [0.0, 0.0, high + touch.rest(cloth)])
+    cloth = touch.raised(cloth, high)
     center = np.array([0.0, 0.0, high - half[2]])
     moved = way(options.acceleration, options.speed, options.step * np.arange(1, options.steps + 1))
     tray = wy.Box(

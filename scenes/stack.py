@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     layers, columns = whole("--layers", options.layers, least=2), whole("--columns", options.columns, least=3)
     profile = zigzag(columns, layers)
     options.columns = len(profile)
-    cloth = touch.flat(options, height=0.0)
+    cloth = touch.flat(options)
     x = np.tile(profile[:, 0], options.rows) * cloth.spacing
     z = np.tile(profile[:, 1], options.rows) * cloth.spacing + touch.rest(cloth)
     cloth = cloth.replace(pose=np.stack([x - x.mean(), cloth.position[:, 1], z], axis=1))

@@ -56,14 +56,19 @@ def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argp
     return options
 
 
-def flat(options: argparse.Namespace, *, height: float) -> wy.Cloth:
-    """The cloth of the options, flat, its middle over the origin."""
+def flat(options: argparse.Namespace) -> wy.Cloth:
+    """The cloth of the options, flat, its middle in the origin."""
     cloth = FABRICS[options.fabric](weave=options.weave, rows=options.rows, columns=options.columns, pose="flat")
-    return cloth.replace(pose=cloth.position - cloth.position.mean(axis=0) + [0.0, 0.0, height])
+    return cloth.replace(pose=cloth.position - cloth.position.mean(axis=0))
+
+
+def raised(cloth: wy.Cloth, height: float) -> wy.Cloth:
+    """The cloth over something of a height [m], at which nothing touches by default, but almost: D + d̂ above it."""
+    return cloth.replace(pose=cloth.position + np.array([0.0, 0.0, height + rest(cloth)]))
 
 
 def rest(cloth: wy.Cloth) -> float:
-    """A height over obstacles at which nothing touches by default, but almost: D + d̂ [m]."""
+    """D + d̂ of the default, and a trifle [m]."""
     return 2.0 * cloth.radius * (1.0 + 1e-6)
 
 
@@ -93,7 +98,7 @@ def finish(run: Run, options: argparse.Namespace, *told: str) -> wy.Trajectory:
     if options.record is not None:
         writers.insert(0, lambda: trajectory.save(options.record))
     if options.png is not None:
-        writers.append(lambda: wy.write_png(options.png, trajectory))
+        writers.append(lambda: wy.write_png(options.png, trajectory, size=(960, 720)))
     if options.mp4 is not None:
         writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
     write_all(trajectory, *writers)
