@@ -42,8 +42,8 @@ def write_usd(
     translation of /cloth, which is in double precision. The file appears whole or not at all; stages of this process
     that have an older one open show the new one.
 
-    Obstacles are of the kind that USD has for their shape, a box a scaled cube, and a plane a rectangle beneath the cloth.
-    Those that move have a translation and a rotation for each frame. Their custom data say their shape and friction.
+    Obstacles are of the kind that USD has for their shape, a box a scaled cube, and a plane a rectangle beneath the
+    cloth. Those that move have a translation and a rotation for each frame. Their custom data say shape and friction.
 
     Args:
         path: of the file, ending in .usd, .usda (text) or .usdc (binary).
