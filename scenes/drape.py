@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import touch
-from common import command, read_number
+from common import command
 
 import warp_yarn as wy
 from warp_yarn.description.obstacles import Obstacle
@@ -29,8 +29,7 @@ def parser() -> argparse.ArgumentParser:
     result = touch.parser(__doc__, "drape", rows=21, columns=21, steps=300)
     result.add_argument("--over", choices=OVER, default="sphere", help="(%(default)s)")
     result.add_argument("--mesh", type=Path, metavar="FILE", help="over what this file has, instead")
-    scale = "metres of a unit of the file (%(default)g)"
-    result.add_argument("--scale", type=lambda s: read_number("--scale", s, above=0.0), default=1.0, help=scale)
+    touch.add_positive(result, "--scale", 1.0, "metres of a unit of the file")
     return result
 
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import touch
-from common import command, read_number
+from common import command
 
 import warp_yarn as wy
 
@@ -24,12 +24,8 @@ GRAVITY = 9.8
 
 def parser() -> argparse.ArgumentParser:
     result = touch.parser(__doc__, "pull", rows=17, columns=17, steps=45)
-    for name, value, text in (("--acceleration", 20.0, "of the tray [m/s²]"), ("--speed", 1.0, "its last [m/s]")):
-
-        def positive(typed: str, name: str = name) -> float:
-            return read_number(name, typed, above=0.0)
-
-        result.add_argument(name, type=positive, default=value, help=f"{text} (%(default)g)")
+    touch.add_positive(result, "--acceleration", 20.0, "of the tray [m/s²]")
+    touch.add_positive(result, "--speed", 1.0, "its last [m/s]")
     return result
 
 

@@ -33,7 +33,7 @@ def small(usd, *arguments, rows=7, columns=7):
 
 def brute(corners, x):
     """Distance to triangles, over a fine grid on each."""
-    s, t = (a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, 201)] * 2))
+    s, t = (a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, 81)] * 2))
     s, t = s[s + t <= 1], t[s + t <= 1]
     a, b, c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     points = (a[:, None] + s[:, None] * b[:, None] + t[:, None] * c[:, None]).reshape(-1, 3)
@@ -45,8 +45,8 @@ def test_distances_to_triangles_are_those_to_their_points():
     vertices, faces = drape.torus(2.0, 0.7, sides=5)
     x = rng.uniform(-3, 3, (60, 3))
     exact, rough = touch.to_triangles(x, vertices[faces]), brute(vertices[faces], x)
-    # of a grid: above, by what half its width adds: at most 2.5 / 200 · √2/2 where x is near
-    assert (exact <= rough + 1e-12).all() and (rough - exact).max() < 0.01
+    # of a grid: above, by what half its width adds: 4 / 80 · √2/2
+    assert (exact <= rough + 1e-12).all() and (rough - exact).max() < 0.035
     assert (exact > 0.05).any() and np.ptp(exact) > 1.0
 
 
@@ -59,25 +59,20 @@ def test_the_look_knows_each_shape(shape):
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     flat = u * [1, 1, 0] / np.linalg.norm(u[:, :2], axis=1, keepdims=True)
     z = rng.uniform(-1, 1, 50)[:, None] * [0, 0, 1.0]
-    upper = np.abs(u)
+    upper, high = np.abs(u), z[:, 2:] > 0
+    rim = np.linalg.norm(u[:, :2], axis=1, keepdims=True) * flat + upper * [0, 0, 1]
     ends = {"start": (0, 0, -1), "end": (0, 0, 1)}
     vertices, faces = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]
     obstacle, x = {
         "plane": (wy.Plane(point=(0, 0, 0), normal=(0, 0, 1)), u * [1, 1, 0] + d * [0, 0, 1]),
         "sphere": (wy.Sphere(center=(0, 0, 0), radius=2), (2 + d) * u),
-        "capsule": (wy.Capsule(**ends, radius=2), np.where(z > 0, [0, 0, 1] + (2 + d) * upper, z + (2 + d) * flat)),
-        "cylinder": (
-            wy.Cylinder(**ends, radius=2),
-            np.where(z > 0, z + (2 + d) * flat, 2 * flat + [0, 0, 1] + d * upper),
-        ),
+        "capsule": (wy.Capsule(**ends, radius=2), np.where(high, [0, 0, 1] + (2 + d) * upper, z + (2 + d) * flat)),
+        # beside it, and beyond its rim: out and up
+        "cylinder": (wy.Cylinder(**ends, radius=2), np.where(high, z + (2 + d) * flat, 2 * flat + [0, 0, 1] + d * rim)),
         # from its corner, into the octant beyond
         "box": (wy.Box(center=(0, 0, 0), half_extents=(1, 2, 3)), [1, 2, 3] + d * upper),
         "mesh": (wy.TriangleMesh(vertices, faces), z @ [[0, 0, 0], [0, 0, 0], [1, 0, 0]] + d * [0, 0, -1]),
     }[shape]
-    if shape == "cylinder":
-        # beyond the rim: out and up
-        out = np.linalg.norm(upper[:, :2], axis=1, keepdims=True) * flat + upper[:, 2:] * [0, 0, 1]
-        x = np.where(z > 0, x, 2 * flat + [0, 0, 1] + d * out)
     each = geometry.Placed(obstacle, np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]]), 0.0, 0.0)
     np.testing.assert_allclose(touch.distances(each, x), d[:, 0], rtol=0, atol=1e-12)
 
@@ -87,18 +82,18 @@ def test_the_look_finds_what_is_too_near(usd):
     touch.look(made)
     inside = made.position.copy()
     inside[3, 24] -= [0, 0, 0.6e-3]
-    with pytest.raises(wy.SimulationError, match="frame 3: nodes are 0.000[0-9]+ m from an obstacle"):
+    with pytest.raises(wy.SimulationError, match=r"frame 3: nodes are 0\.000\d+ m from an obstacle"):
         touch.look(dataclasses.replace(made, position=inside))
     folded = made.position.copy()
     folded[2, -1] = folded[2, 0] + [0, 0, 1.4e-3]
-    with pytest.raises(wy.SimulationError, match="frame 2: nodes are 0.0014 m from each other, must be above 0.0015"):
+    with pytest.raises(wy.SimulationError, match=r"frame 2: nodes are 0\.0014 m from each other"):
         touch.look(dataclasses.replace(made, position=folded))
 
 
 # -- scenes -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("integrator", touch.CLEAR)
+@pytest.mark.parametrize("integrator", touch.INTEGRATORS)
 @pytest.mark.parametrize("over", drape.OVER)
 def test_a_cloth_drapes(over, integrator, usd, capsys):
     """main() looks at every frame, and fails where anything came too near."""
@@ -116,7 +111,9 @@ def test_a_cloth_drapes(over, integrator, usd, capsys):
 def test_a_cloth_drapes_over_a_file(usd, tmp_path):
     pytest.importorskip("trimesh")
     vertices, faces = drape.torus(24.0, 9.0, sides=12)
-    lines = ["v {} {} {}".format(*v + [5, 6, 7]) for v in vertices] + ["f {} {} {}".format(*f + 1) for f in faces]
+    lines = ["v {} {} {}".format(*v) for v in vertices + np.array([5, 6, 7])] + [
+        "f {} {} {}".format(*f + 1) for f in faces
+    ]
     (tmp_path / "ring.obj").write_text("\n".join(lines))
     arguments = small(usd, "--mesh", tmp_path / "ring.obj", "--scale", 1e-4, "--steps", 10, "--weave", "satin")
     mesh = drape.main(arguments).scene.obstacles[1]
@@ -146,13 +143,21 @@ def test_a_tray_takes_a_cloth_along_as_far_as_friction_can(usd):
     t = 1e-3 * np.arange(101)
     # ½ a t² until 50 ms, then steadily; it creeps back by less than ε t
     assert went == pytest.approx(0.05 * (t[-1] - 0.025), abs=1e-4)
-    fast = pull.main(
-        small(usd, "--acceleration", 50, "--speed", 2, "--friction", 0.2, "--steps", 12, rows=9, columns=9)
-    )
+    arguments = ["--acceleration", 50, "--speed", 2, "--friction", 0.2, "--steps", 12]
+    fast = pull.main(small(usd, *arguments, rows=9, columns=9))
     went = (fast.position[:, :, 1] - fast.position[0, :, 1]).mean(axis=1)
-    # implicit Euler, from rest: k (k + 1)/2 h² a
+    # implicit Euler, from rest: k (k + 1)/2 h² a; the load is there after a step or two
     k = np.arange(13)
-    assert went[3:] == pytest.approx((0.2 * 9.8 * 1e-6 * k * (k + 1) / 2)[3:], rel=0.1)
+    assert went[5:] == pytest.approx((0.2 * 9.8 * 1e-6 * k * (k + 1) / 2)[5:], rel=0.1)
+
+
+def test_a_seed_moves_the_start_a_little(usd):
+    plain, one, two, again = (
+        pull.main(small(usd, "--steps", 1, *seed)).position[0]
+        for seed in ([], ["--seed", 1], ["--seed", 2], ["--seed", 1])
+    )
+    assert np.array_equal(one, again) and not np.array_equal(one, two)
+    assert 5e-6 < np.abs(one - plain).max() <= 1e-5
 
 
 def test_the_way_of_a_tray_is_of_its_acceleration():
@@ -188,13 +193,13 @@ def test_layers_of_a_stack_settle_two_and_a_half_spacings_apart(usd, capsys):
     [
         (drape, ["--over", "cloud"], "--over"),
         (drape, ["--mesh", "nowhere.obj"], "nowhere.obj"),
-        (drape, ["--scale", "0"], "--scale = 0"),
+        (drape, ["--scale", "0"], "--scale"),
         (drape, ["--integrator", "linear"], "--integrator"),
         (drape, ["--friction", "-1"], "friction = -1"),
         (drape, ["--steps", "0"], "--steps = 0"),
         (fold, ["--fold", "0"], "--fold = 0"),
-        (pull, ["--speed", "0"], "--speed = 0"),
-        (pull, ["--acceleration", "fast"], "--acceleration = 'fast'"),
+        (pull, ["--speed", "0"], "--speed"),
+        (pull, ["--acceleration", "fast"], "--acceleration"),
         (stack, ["--layers", "1"], "--layers = 1"),
         (stack, ["--columns", "2"], "--columns = 2"),
     ],
@@ -213,12 +218,14 @@ def test_wrong_arguments_end_with_code_2_and_a_message(scene, arguments, named, 
 def every_obstacle():
     path = np.hstack([np.linspace(0, 1e-4, 12).reshape(4, 3), np.tile(QUARTER, (4, 1))])
     return [
-        wy.Plane(point=(0, 0, -2e-3), normal=(0.1, 0.2, 0.7), friction=0.1, path=path[:, :3]),
+        wy.Plane(point=(0, 0, -2e-3), normal=(0.1, 0.2, 0.7), friction=0.1, path=path[:, :3] - np.array([0, 0, 2e-3])),
         wy.Sphere(center=(5e-3, 0, -4e-3), radius=1e-3, friction=0.2),
         wy.Capsule(start=(1, 0, 0), end=(1, 0.1, 0.3), radius=0.05),
-        wy.Cylinder(start=(1, 1, 0), end=(1.2, 1.1, 0.3), radius=0.05, path=path + [1, 1, 0, 0, 0, 0, 0]),
+        wy.Cylinder(start=(1, 1, 0), end=(1.2, 1.1, 0.3), radius=0.05, path=path + np.eye(7)[0] + np.eye(7)[1]),
         wy.Box(center=(2, 0, 0), half_extents=(0.1, 0.2, 0.3), rotation=QUARTER, friction=0.0),
-        wy.TriangleMesh(*drape.torus(0.2, 0.1, sides=4), position=(3, 0, 0), rotation=HALF_TURN, path=path),
+        wy.TriangleMesh(
+            *drape.torus(0.2, 0.1, sides=4), position=(3, 0, 0), rotation=HALF_TURN, path=path + 3 * np.eye(7)[0]
+        ),
     ]
 
 
@@ -286,9 +293,8 @@ def test_an_obstacle_moves_and_turns_steadily_between_frames():
     box = wy.Box(center=(0, 0, 0), half_extents=(1, 1, 1), path=path)
     still = wy.Simulator(wy.Scene(cloth)).run(0)
     at = np.array([0.0, 0.5, 1.0, 1.25, 2.5, 3.0, 7.0])
-    shown = dataclasses.replace(
-        still, scene=wy.Scene(cloth, obstacles=[box]), position=np.tile(cloth.position, (7, 1, 1))
-    )
+    frames = np.tile(cloth.position, (7, 1, 1))
+    shown = dataclasses.replace(still, scene=wy.Scene(cloth, obstacles=[box]), position=frames)
     [each] = geometry.placed(shown, at)
     expected = [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 0.5, 0], [1, 2, 2], [1, 2, 4], [1, 2, 4]]
     np.testing.assert_allclose(each.position, expected, rtol=0, atol=1e-15)
@@ -311,17 +317,17 @@ def test_obstacles_are_in_pictures_where_they_are(tmp_path):
     import imageio.v2 as imageio
 
     cloth = wy.paper.cloth(rows=5, columns=5, pose="flat")
-    sphere = wy.Sphere(center=(2e-3, 2e-3, -4e-3), radius=1.5e-3, path=[[2e-3, 2e-3, 4e-3]])
+    sphere = wy.Sphere(center=(2e-3, 2e-3, -1.8e-3), radius=1.2e-3, path=[[2e-3, 2e-3, 1.8e-3]])
     still = wy.Simulator(wy.Scene(cloth, gravity=None)).run(1)
     images = []
     for frame, scene in ((0, [sphere]), (1, [sphere]), (1, [])):
         shown = dataclasses.replace(still, scene=wy.Scene(cloth, obstacles=scene))
         wy.write_png(tmp_path / "a.png", shown, frame=frame, size=(160, 120), view=(0, -1, 0))
         images.append(imageio.imread(tmp_path / "a.png").astype(float))
-    grey = [np.abs(np.diff(image, axis=2)).max(axis=2) + 1000 * (image.max(axis=2) > 200) < 30 for image in images]
+    grey = [(np.ptp(image, axis=2) < 16) & (image.max(axis=2) < 190) & (image.max(axis=2) > 90) for image in images]
     rows = np.arange(120)[:, None]
     counts = [mask.sum() for mask in grey]
-    assert counts[0] > 500 and counts[1] > 500 and counts[2] < 50
+    assert counts[0] > 300 and counts[1] > 300 and counts[2] < 50
     # below the middle of the picture, then above it
     assert (grey[0] * rows).sum() / counts[0] > 65 and (grey[1] * rows).sum() / counts[1] < 55
 

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..description.cloth import Cloth
-from ..description.obstacles import Obstacle
+from ..description.obstacles import Obstacle, TriangleMesh
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..errors import InputError, finite_array
 from ..kernels import Variant, build
@@ -171,8 +171,8 @@ class Placed:
         low, high = np.zeros(3), np.zeros(3)
         if obstacle.shape == "plane":
             high[:2] = 0.5 * self.width, 0.5 * self.length
-        elif obstacle.shape == "mesh":
-            low, high = obstacle.vertices.min(axis=0), obstacle.vertices.max(axis=0)  # type: ignore[attr-defined]
+        elif isinstance(obstacle, TriangleMesh):
+            low, high = obstacle.vertices.min(axis=0), obstacle.vertices.max(axis=0)
         elif obstacle.shape == "box":
             high = obstacle.size
         elif obstacle.shape == "sphere":
