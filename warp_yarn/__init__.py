@@ -6,6 +6,7 @@ from types import ModuleType
 
 from . import moved
 from .description.cloth import Cloth, Yarn
+from .description.cloths import Cloths
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
@@ -26,6 +27,7 @@ __all__ = [
     "Box",
     "Capsule",
     "Cloth",
+    "Cloths",
     "Contact",
     "Cylinder",
     "GradientError",

@@ -24,10 +24,18 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.variant import Variant
+from ..linear import pair_blocks
 
 CYCLING = 12
 """Evaluations in a stage after which every third matrix takes f₁/|v| for f₁′: a flat landing may else go to and fro
 between sticking and sliding for ever. (Always, Newton's iteration would creep.)"""
+
+
+FAST = 0.05
+"""Part of its range by which a contact's gap may change in a step of two stages: the second one's base is extrapolated
+from the first, and gains up to half of an impact's energy beyond."""
+TOUCHES, PAIRS_TOUCH, IMPACTS = 0, pair_blocks.PAIRS, 2
+"""Places of ``touching``: whether anything touches, two nodes of the cloth, anything so fast; of the last state."""
 
 
 @functools.cache
@@ -119,4 +127,14 @@ def functions(variant: Variant) -> SimpleNamespace:
             result += wp.outer(across, across) * (held * falls / (speed * speed))
         return result
 
-    return SimpleNamespace(barrier=barrier, load=contact_load, force=contact_force, matrix=contact_matrix)
+    @wp.func
+    def note_contact(law: ContactLaw, n: vec3, v: vec3, change: vec3, step_size: scalar, touching: wp.array(dtype=int)):
+        """Notes that something touches, and whether its gap changes much in a step, at either end of the stage."""
+        touching[wp.static(TOUCHES)] = 1
+        rate = wp.dot(n, v)
+        if step_size * wp.max(wp.abs(rate), wp.abs(rate + wp.dot(n, change))) > scalar(FAST) * law.range[0]:
+            touching[wp.static(IMPACTS)] = 1
+
+    return SimpleNamespace(
+        note=note_contact, barrier=barrier, load=contact_load, force=contact_force, matrix=contact_matrix
+    )

@@ -15,9 +15,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.status import OVERLAPPING
+from ..core.status import IMPACT, OVERLAPPING
 from ..core.variant import Variant
-from . import distances, obstacles
+from . import obstacles
+from .barrier import IMPACTS, TOUCHES
 from .distances import MESH
 
 LEFT = 0.1
@@ -30,7 +31,6 @@ PLACES = 24
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
     to_obstacle = obstacles.functions(variant).to_obstacle
-    closest_on_triangle = distances.functions(variant).closest_on_triangle
     Obstacles = obstacles.structs(variant.forward).Obstacles
     module = variant.module("contact_limits")
 
@@ -155,10 +155,17 @@ def define(variant: Variant) -> SimpleNamespace:
                 status[1] = i
 
     @wp.kernel(module=module, enable_backward=False)
-    def ask_where_touching(touches: wp.array(dtype=int), refreshes: wp.array(dtype=int)):
+    def ask_where_touching(touching: wp.array(dtype=int), refreshes: wp.array(dtype=int)):
         """Asks for a new matrix where anything touches: the barrier's changes from iterate to iterate."""
-        if touches[0] != 0:
+        if touching[wp.static(TOUCHES)] != 0:
             refreshes[0] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def refuse_impact(touching: wp.array(dtype=int), status: wp.array(dtype=int)):
+        """Leaves a step with an impact to a method that does not extrapolate."""
+        if status[0] == 0 and touching[wp.static(IMPACTS)] != 0:
+            status[0] = wp.static(IMPACT)
+            status[1] = -1
 
     @wp.kernel(module=module, enable_backward=False)
     def copy_rotations(source: wp.array(dtype=quat), target: wp.array(dtype=quat)):
@@ -166,6 +173,7 @@ def define(variant: Variant) -> SimpleNamespace:
         target[k] = source[k]
 
     return SimpleNamespace(
+        refuse_impact=refuse_impact,
         ask_where_touching=ask_where_touching,
         copy_rotations=copy_rotations,
         find_faces=find_faces,

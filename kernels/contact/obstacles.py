@@ -80,7 +80,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    vec3, mat33 = variant.vec3, variant.mat33
+    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    note_contact = barrier.functions(variant).note
     to_obstacle, obstacle_speed = functions(variant).to_obstacle, functions(variant).obstacle_speed
     contact_force, contact_matrix = barrier.functions(variant).force, barrier.functions(variant).matrix
     Obstacles, ContactLaw = structs(variant.forward).Obstacles, structs(variant.forward).ContactLaw
@@ -92,10 +93,12 @@ def define(variant: Variant) -> wp.Kernel:
         # state in
         position: wp.array(dtype=vec3),
         velocity: wp.array(dtype=vec3),
+        increment: wp.array(dtype=vec3),
+        step_size: wp.array(dtype=scalar),
         tries: wp.array(dtype=int),
         # forces out, and whether anything touches
         force: wp.array(dtype=vec3),
-        touches: wp.array(dtype=int),
+        touching: wp.array(dtype=int),
         # matrix out
         matrix: int,
         weights: wp.array(dtype=vec3),
@@ -112,7 +115,7 @@ def define(variant: Variant) -> wp.Kernel:
             n = vec3(at[0], at[1], at[2])
             v = velocity[i] - obstacle_speed(obstacles, k, x)
             wp.atomic_add(force, i, contact_force(law, obstacles.obstacle_friction[k], gap, n, v))
-            touches[0] = 1
+            note_contact(law, n, v, increment[i], step_size[0], touching)
             if matrix != 0:
                 wp.atomic_add(
                     diagonal_xx,

@@ -22,11 +22,13 @@ from ..core.status import OVERLAPPING
 from ..core.variant import Term, Variant
 from ..linear import pair_blocks
 from . import barrier
+from .barrier import PAIRS_TOUCH
 
 
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
     contact_force, contact_matrix = barrier.functions(variant).force, barrier.functions(variant).matrix
+    note_contact = barrier.functions(variant).note
     ContactLaw = barrier.structs(variant.forward).ContactLaw
     Pairs = pair_blocks.structs(variant.forward).Pairs
 
@@ -38,11 +40,12 @@ def define(variant: Variant) -> wp.Kernel:
         # state in
         position: wp.array(dtype=vec3),
         velocity: wp.array(dtype=vec3),
+        increment: wp.array(dtype=vec3),
+        step_size: wp.array(dtype=scalar),
         tries: wp.array(dtype=int),
         # forces out, and whether anything touches
         force: wp.array(dtype=vec3),
-        touches: wp.array(dtype=int),
-        any_touch: wp.array(dtype=int),
+        touching: wp.array(dtype=int),
         # matrix out
         matrix: int,
         weights: wp.array(dtype=vec3),
@@ -61,8 +64,8 @@ def define(variant: Variant) -> wp.Kernel:
                 n = r / gap
                 v = velocity[p] - velocity[q]
                 wp.atomic_add(force, p, contact_force(self_law, contact_friction[0], gap, n, v))
-                touches[0] = 1
-                any_touch[0] = 1
+                note_contact(self_law, n, v, increment[p] - increment[q], step_size[0], touching)
+                touching[wp.static(PAIRS_TOUCH)] = 1
                 if matrix != 0:
                     b = contact_matrix(self_law, contact_friction[0], gap, n, v, weights[0], tries[0])
                     wp.atomic_add(diagonal_xx, p, b)

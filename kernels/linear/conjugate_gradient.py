@@ -263,7 +263,7 @@ def define(variant: Variant) -> SimpleNamespace:
                         put(p_s, s, zero)
                         start += at(euler_solution, s) * at(euler_solution, s)
             start = total(start, 0, strip, strips, met, team, sums)
-            touch = pairs.any_touch[0] != 0
+            touch = pairs.touching[wp.static(pair_blocks.PAIRS)] != 0
             if touch and start != zero:
                 # r = b − C x, the rest of A comes with the sweep
                 for i in range(begin, end):

@@ -429,7 +429,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     break
             met = team[5]
             unused = zero
-            touch = pairs.any_touch[0] != 0
+            touch = pairs.touching[wp.static(pair_blocks.PAIRS)] != 0
             for i in range(begin, end):
                 unused += multiply_row(
                     i, stencil, neighbour, levels.lower, diagonal_xx, diagonal_xs, diagonal_ss,

@@ -13,6 +13,9 @@ import warp as wp
 
 from ..core.variant import Variant
 
+PAIRS = 1
+"""Place of ``touching``."""
+
 
 @functools.cache
 def structs(variant: Variant) -> SimpleNamespace:
@@ -21,13 +24,13 @@ def structs(variant: Variant) -> SimpleNamespace:
     @wp.struct
     class Pairs:
         """Of each node as many rows as ``near_room`` says: the nodes that are near it, and of those that touch it the
-        block B, which is 0 for the others. ``any_touch`` is 0 where no two of the cloth touch."""
+        block B, which is 0 for the others. ``touching[PAIRS]`` is 0 where no two of the cloth touch."""
 
         near_room: int
         near_count: wp.array(dtype=int)
         near: wp.array(dtype=int)
         near_block: wp.array(dtype=sym33)
-        any_touch: wp.array(dtype=int)
+        touching: wp.array(dtype=int)
 
     return SimpleNamespace(Pairs=Pairs)
 

@@ -145,10 +145,14 @@ def define(variant: Variant) -> SimpleNamespace:
     def start_rigid(
         nodes: int,
         node_mass: wp.array(dtype=scalar),
+        touching: wp.array(dtype=int),
         rhs: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
     ):
         """δ of a free cloth that moves as one: the solver need not find how it falls, to its tolerance."""
+        if touching[0] != 0:
+            # what it touches does not let it
+            return
         momentum = vec3()
         mass = scalar(0.0)
         for i in range(nodes):
@@ -245,6 +249,10 @@ def define(variant: Variant) -> SimpleNamespace:
         small = left < scalar(1.0) and left * norm <= newton_tolerance[0] * change[0]
         if norm == scalar(0.0) or (step_length[0] == scalar(1.0) and small):
             finishes[0] = 1
+        if -slope[0] > newton_tolerance[0] * change[0] * newton_tolerance[0] * change[0] and status[0] == 0:
+            # a direction along which r does not fall: the linear solve has no digit right
+            status[0] = wp.static(STALLED)
+            status[1] = -1
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(

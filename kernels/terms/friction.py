@@ -35,6 +35,10 @@ SOFTNESS = 0.1
 """The spring gives way from this part under μF_n to as much beyond, by a parabola, so that the force has a derivative
 at the limit too."""
 
+CYCLING = 4
+"""Evaluations in a stage after which every second matrix has the force over δ, if that is more: sliding either way the
+force does not change with δ, so that Newton's iteration goes to and fro between the two. (Always, it would creep.)"""
+
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
@@ -111,6 +115,7 @@ def define(variant: Variant) -> wp.Kernel:
         friction_force_out: wp.array(dtype=scalar),
         euler_momentum: wp.array(dtype=scalar),
         # matrix out
+        tries: wp.array(dtype=int),
         matrix: int,
         weights: wp.array(dtype=vec3),
         diagonal_ss: wp.array(dtype=scalar),
@@ -134,7 +139,11 @@ def define(variant: Variant) -> wp.Kernel:
             if matrix != 0:
                 damping = weights[0][1] * friction_damping[0]
                 wp.atomic_add(euler_momentum, s, damping * euler_velocity[s])
-                wp.atomic_add(diagonal_ss, s, damping + weights[0][2] * f[1])
+                slope = f[1]
+                if tries[0] > wp.static(CYCLING) and tries[0] % 2 == 0:
+                    delta = wp.abs(euler[s] - anchor[s])
+                    slope = wp.max(slope, wp.abs(f[0]) / wp.max(delta, floor / friction_stiffness[0]))
+                wp.atomic_add(diagonal_ss, s, damping + weights[0][2] * slope)
 
     return friction_term
 

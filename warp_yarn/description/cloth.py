@@ -218,6 +218,16 @@ class Cloth(Fixed):
             raise InputError(f"node (row {row}, column {column}) is outside a cloth of {rows} × {columns}")
         return int(column % columns + (row % rows) * columns)
 
+    def place(self, node: int) -> str:
+        """Where a node is, in words."""
+        row, column = divmod(int(node), self.weave.columns)
+        return f"row {row}, column {column}"
+
+    @property
+    def rest_place(self) -> np.ndarray:
+        """(u, v) at rest [nodes, 2], by which arcs along the cloth are compared (m)."""
+        return self.euler
+
     def corners(self, which: str = "all") -> list[int]:
         """Nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
         choice("which", which, ("top", "bottom", "all"))

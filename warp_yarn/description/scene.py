@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError, choice, finite_array, indices, number
 from ..kernels import TERMS
 from .cloth import Cloth, Fixed
+from .cloths import Cloths, as_one
 from .obstacles import Contact, Obstacle
 
 
@@ -42,7 +43,7 @@ class Scene(Fixed):
     another one.
 
     Args:
-        cloth: the cloth.
+        cloth: the cloth, or several, whose nodes are numbered on from one to the next (``Cloths``).
         gravity: acceleration [m/s²], 3 numbers, or None.
         wind: a Wind, or None.
         pins: nodes that are held, such as ``cloth.corners("top")``.
@@ -62,7 +63,7 @@ class Scene(Fixed):
 
     def __init__(
         self,
-        cloth: Cloth,
+        cloth: Cloth | Cloths | Sequence[Cloth],
         *,
         gravity: Sequence[float] | None = (0.0, 0.0, -9.8),
         wind: Wind | None = None,
@@ -77,20 +78,18 @@ class Scene(Fixed):
         self_contact: bool = False,
         contact: Contact | None = None,
     ):
-        if not isinstance(cloth, Cloth):
-            raise InputError(f"cloth = {cloth!r}, must be a Cloth")
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
-        self.cloth = cloth
+        self.cloth = as_one(cloth)
         self.gravity = None if gravity is None else finite_array("gravity", gravity, (3,))
         self.wind = wind
-        self.pins = indices("pins", pins, cloth.nodes, "node")
+        self.pins = indices("pins", pins, self.cloth.nodes, "node")
         self.pin_stiffness = None if pin_stiffness is None else number("pin_stiffness", pin_stiffness, above=0.0)
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
         checked = self._checked_forces(forces)
-        self.force_nodes = indices("forces", list(checked), cloth.nodes, "node")
+        self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
         self.force_path = self._force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
@@ -103,7 +102,7 @@ class Scene(Fixed):
         self.contact = Contact() if contact is None else contact
         self.terms = self._terms(terms)
         self._fix(
-            cloth=cloth,
+            cloth=self.cloth,
             gravity=self.gravity,
             wind=wind,
             pins=self.pins,

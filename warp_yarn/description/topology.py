@@ -5,6 +5,7 @@ function that returns a Topology, with nodes numbered so that every yarn runs th
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -49,6 +50,32 @@ class Topology:
     """[triangles, 3]: matrix blocks of its edges, in a stencil six wide."""
     neighbour: np.ndarray
     """[nodes, 6]: upper neighbours in the matrix, -1 where there is none (see ``kernels/linear/block_matrix.py``)."""
+
+
+def side_by_side(parts: Sequence[Topology]) -> Topology:
+    """Several cloths as one, their nodes and yarns numbered on from one to the next."""
+    nodes = np.cumsum([0, *(part.nodes for part in parts)])
+    yarns = np.cumsum([0, *(len(part.yarn_direction) for part in parts)])
+    # no place in the weave is that of two nodes
+    places = np.cumsum([[0, 0], *(part.node_yarns.max(axis=0) + 1 for part in parts)], axis=0)
+
+    def moved(name: str, by: np.ndarray) -> np.ndarray:
+        values = [getattr(part, name) for part in parts]
+        joined = [np.where(value >= 0, value + shift, value) for value, shift in zip(values, by, strict=False)]
+        return np.concatenate(joined).astype(values[0].dtype)
+
+    still = np.zeros_like(nodes)
+    offsets = {
+        **dict.fromkeys(
+            ("segment_nodes", "bend_nodes", "crossing_node", "crossing_neighbours", "triangle_nodes"), nodes
+        ),
+        **dict.fromkeys(("segment_yarn", "bend_yarn"), yarns),
+        **dict.fromkeys(("corner_blocks", "triangle_blocks"), 6 * nodes),
+        **dict.fromkeys(("yarn_direction", "is_crossing", "flipped", "corner_jams"), still),
+        "neighbour": nodes,
+        "node_yarns": places,
+    }
+    return Topology(nodes=int(nodes[-1]), **{name: moved(name, by) for name, by in offsets.items()})
 
 
 def rectangle(weave: Weave) -> Topology:

@@ -59,9 +59,8 @@ class Arrays(dict[str, Any]):
             "pairs": (pair_blocks.structs(variant.forward).Pairs, ""),
         }
         """Structs of arrays, and what their arrays' names begin with."""
-        self["any_touch"] = self.zeros(1, wp.int32)
-        if scene.obstacles or scene.self_contact:
-            self["touches"] = self.zeros(1, wp.int32)
+        self["tries"] = self.zeros(1, wp.int32)
+        self["touching"] = self.zeros(3, wp.int32)
         if scene.obstacles:
             self._law(
                 "contact", scene.contact.distance or scene.cloth.radius, scene.contact.range or scene.cloth.radius
@@ -203,28 +202,28 @@ class Arrays(dict[str, Any]):
         self["near_margin"] = self.numbers(margin)
         self["near_reach"] = self.numbers(distance + reach + margin)
         self["folds_from"] = self.numbers(0.5 * np.pi * (distance + reach))
-        self["rest_place"] = self.numbers(cloth.euler.ravel())
+        self["rest_place"] = self.numbers(cloth.rest_place.ravel())
         self["near_count"] = self.zeros(nodes, wp.int32)
-        # far from everywhere: the first look makes a list
-        self["near_position"] = self.numbers(np.full((nodes, 3), np.nan))
+        self["near_position"] = self.zeros(nodes, self.variant.vec3)
         self["outdated"] = self.zeros(1, wp.int32)
-        side = int(np.clip(max(cloth.weave.rows, cloth.weave.columns) * cloth.spacing / (distance + reach), 8, 128))
+        side = int(np.clip(np.sqrt(nodes) * cloth.spacing / (distance + reach), 8, 128))
         self.grid = wp.HashGrid(side, side, side, device=self.device, dtype=self.variant.scalar)
         self.grid.reserve(nodes)
         self.make_near_room(NEAR_ROOM)
 
     def make_near_room(self, room: int) -> None:
-        """Makes room for so many nodes near each."""
+        """Makes room for so many nodes near each; the next look makes a list."""
         self["near_room"] = room
         self["near"] = self.zeros(room * self["nodes"], wp.int32)
         self["near_block"] = self.zeros(room * self["nodes"], self.variant.sym33)
+        # far from everywhere
+        self["near_position"].fill_(np.nan)
 
     def node_mass(self) -> float:
         """Mean mass of a node [kg]."""
         cloth = self.scene.cloth
-        lengths = [cloth.weave.columns - 1] * cloth.weave.rows + [cloth.weave.rows - 1] * cloth.weave.columns
-        mass = sum(cloth.yarns[k].density * n for k, n in zip(cloth.material, lengths, strict=True)) * cloth.spacing
-        return mass / cloth.nodes
+        density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
+        return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
 
     def quaternions(self, values: np.ndarray) -> wp.array:
         return wp.array(
@@ -373,7 +372,8 @@ class Arrays(dict[str, Any]):
         dim = self.dims[elements] if isinstance(elements, str) else elements
         if dim:
             inputs = [replaced[a.label] if a.label in replaced else self.find(a.label) for a in kernel.adj.args]
-            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+            # what has no reverse is no part of a tape
+            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=kernel.options["enable_backward"])
 
     def find(self, label: str) -> Any:
         """What a kernel's argument of this name stands for; ``x_grad`` is the gradient of ``x``."""

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from ..description.cloths import Cloths
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, number, whole
@@ -197,7 +198,11 @@ class Model:
                 f"threads = {threads}, must be 1 on {self.device} with the {self.preconditioner!r} preconditioner: "
                 "only the CPU's 'incomplete' and 'multilevel' ones share their work"
             )
-        columns = self.scene.cloth.weave.columns
+        cloth = self.scene.cloth
+        if threads > 1 and isinstance(cloth, Cloths):
+            raise InputError(f"threads = {threads} with several cloths, must be 1: strips are of one")
+        # the sweeps of one thread go from node to node, whatever a row is
+        columns = cloth.nodes if isinstance(cloth, Cloths) else cloth.weave.columns
         self.strips = max(1, min(threads, columns // NARROWEST_STRIP))
         a["columns"] = columns
         a["sums"] = a.zeros(5 * self.strips, a.variant.scalar)
@@ -284,7 +289,7 @@ class Model:
     def _find_contacts(self) -> None:
         """Looks for what obstacles' contact needs to know of the present positions."""
         if self.touches:
-            self.arrays.zero("touches", "any_touch")
+            self.arrays.zero("touching")
         if self.scene.obstacles and any(self.arrays.meshes):
             self.launch("find_faces", "node_obstacles")
         if self.scene.self_contact:
@@ -329,7 +334,7 @@ class Model:
 
     def report_obstacles(self) -> Near:
         """Every node and obstacle, and their force."""
-        a, nodes, several = self.arrays, self.scene.cloth.nodes, len(self.scene.obstacles)
+        nodes, several = self.scene.cloth.nodes, len(self.scene.obstacles)
         self._find_contacts()
         gaps, forces = self._reported("report_contacts", "node_obstacles", nodes * several)
         node, obstacle = np.divmod(np.arange(nodes * several), several)

@@ -93,10 +93,9 @@ class Adjoint:
         a = self.arrays
         code, node = (int(value) for value in a["status"].numpy()[:2])
         a.zero("status")
-        columns = self.simulator.scene.cloth.weave.columns
         where = f"step {k}"
         if node >= 0:
-            where += f", at node {node} (row {node // columns}, column {node % columns})"
+            where += f", at node {node} ({self.simulator.scene.cloth.place(node)})"
         term = None
         if code == NOT_FINITE:
             message = f"the adjoint of {where} is not finite"

@@ -98,6 +98,12 @@ class StageMethod:
         """Launches a part of the step."""
         self._graphs.run(part.__name__, part)
 
+    def forget_graphs(self) -> None:
+        """Captures anew, after arrays have changed their place."""
+        self._graphs.clear()
+        if hasattr(self, "_around"):
+            self.prepare_adjoint(*self._around)
+
     # -- forward -----------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
@@ -116,6 +122,7 @@ class StageMethod:
                 if estimates:
                     model.copy(predicted="solution")
             self._newton(stage)
+            self._refuse_impact()
             model.add_work(self._shares[stage])
         if estimates:
             model.launch("estimate_error", 1)
@@ -198,10 +205,16 @@ class StageMethod:
         self.model.keep_clear()
         if stage == 0:
             self._evaluate(matrix=True)
+            # where it starts with one already, the rest need not be made
+            self._refuse_impact()
         else:
             self._evaluate_as_asked()
         self._judge()
         wp.capture_while(a["continues"], lambda: self._iterate(stage))
+
+    def _refuse_impact(self) -> None:
+        if self.model.touches and self.model.watches and self.fallback is not None:
+            self.model.launch("refuse_impact", 1)
 
     def _evaluate_as_asked(self) -> None:
         wp.capture_if(

@@ -23,8 +23,8 @@ from ..device.model import Graphs, Model
 from ..errors import InputError, SimulationError, choice, number, whole
 from ..integrators import INTEGRATORS
 from ..kernels.core import status
-from .linear_system import System, gather
 from .contacts import Contacts, contacts_of
+from .linear_system import System, gather
 from .state import CLOTH_NUMBERS, FIELDS, State, Trajectory
 from .substepping import Parts
 
@@ -391,9 +391,9 @@ class Simulator:
             least = float(self.arrays["self_contact_distance"].numpy()[0])
             if len(pairs.gap) and not pairs.gap.min() > least:
                 k = int(pairs.gap.argmin())
-                places = [divmod(int(node), self.scene.cloth.weave.columns) for node in (pairs.node[k], pairs.other[k])]
+                places = [self.scene.cloth.place(node) for node in (pairs.node[k], pairs.other[k])]
                 raise InputError(
-                    f"nodes {pairs.node[k]} and {pairs.other[k]} (row, column {places[0]} and {places[1]}) are "
+                    f"nodes {pairs.node[k]} and {pairs.other[k]} ({places[0]} and {places[1]}) are "
                     f"{pairs.gap[k]:.3g} m apart: must be above the contact's self_distance, {least:.3g} m"
                 )
         if not self.scene.obstacles:
@@ -404,9 +404,8 @@ class Simulator:
         if not near.gap.min() > least:
             at = int(near.gap.argmin())
             node, k = near.node[at], near.obstacle[at]
-            row, column = divmod(int(node), self.scene.cloth.weave.columns)
             raise InputError(
-                f"node {node} (row {row}, column {column}) is {near.gap[at]:.3g} m from obstacles[{k}], a "
+                f"node {node} ({self.scene.cloth.place(node)}) is {near.gap[at]:.3g} m from obstacles[{k}], a "
                 f"{type(self.scene.obstacles[k]).__name__}: must be above the contact's distance, {least:.3g} m"
             )
 
@@ -478,15 +477,31 @@ class Simulator:
         status = self.arrays["status"].numpy()
         return int(status[2]) - 1 - first if status[0] else steps
 
+    def _make_room(self) -> None:
+        """Makes room for twice as many nodes near each: what was captured has the arrays of before."""
+        with ALONE:
+            self.arrays.make_near_room(2 * self.arrays["near_room"])
+        self.integrator.forget_graphs()
+        self.parts.forget_graphs()
+
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
         ledger = {name: self.arrays[name].numpy().copy() for name in LEDGER if name in self.arrays}
         parts = self.parts
         self._step_in_parts = _StepInParts(frame, (parts.size, parts.made, parts.rejected, parts.damped), ledger)
         gained, damped = False, parts.damped
+        while int(self.arrays["status"].numpy()[0]) == status.CROWDED:
+            self._make_room()
+            self._restore(frame)
+            self.arrays.put("status", 0, 0, 0)
+            self._count(frame)
+            self.integrator.advance()
+            if not self.arrays["status"].numpy()[0]:
+                self._step_in_parts = None
+                return True
         if self.step_error is None:
             # it could not be made at once
-            gained = parts.can_damp and int(self.arrays["status"].numpy()[0]) == status.GAINED
+            gained = parts.can_damp and int(self.arrays["status"].numpy()[0]) in (status.GAINED, status.IMPACT)
             self._restore(frame)
             self.arrays.put("status", 0, 0, 0)
             parts.size = 1.0 if gained else 0.5
@@ -576,10 +591,9 @@ class Simulator:
         iterations = int(self.arrays["iterations"].numpy()[0])
         self.arrays.put("status", 0, 0, 0)
         term = self._blame(node)
-        columns = self.scene.cloth.weave.columns
         where = f"step {k} (t = {k * self.step_size:g} s):"
         if node >= 0:
-            where += f" at node {node} (row {node // columns}, column {node % columns})"
+            where += f" at node {node} ({self.scene.cloth.place(node)})"
         smallest = self.parts.tried * self.step_size
         what = {
             status.NOT_FINITE: "a value is not finite",
@@ -595,6 +609,7 @@ class Simulator:
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
             status.OVERLAPPING: "it is pressed into an obstacle that leaves it no way out",
             status.CROWDED: "more of it comes together than there is room for",
+            status.IMPACT: "something strikes it",
             status.INACCURATE: f"its error stays above step_error = {self.step_error}: allow more",
         }[code]
         raise SimulationError(

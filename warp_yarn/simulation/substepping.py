@@ -12,7 +12,7 @@ from typing import Any
 from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE
 from ..device.model import Graphs, Model
-from ..kernels.core.status import GAINED, INACCURATE
+from ..kernels.core.status import GAINED, IMPACT, INACCURATE
 
 SMALLEST = 2.0**-7
 """Of a step, where a part is halved because it cannot be made."""
@@ -52,6 +52,12 @@ class Parts:
         """Begins anew, as for another motion."""
         self.size = self.tried = 1.0
         self.made = self.rejected = self.damped = 0
+
+    def forget_graphs(self) -> None:
+        """Captures anew, after arrays have changed their place."""
+        self._graphs.clear()
+        if self._fallback is not None:
+            self._fallback.forget_graphs()
 
     def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
@@ -103,7 +109,7 @@ class Parts:
         """Whether the fallback is to make the part: it gains energy, or could not be made and is the smallest."""
         if not self.can_damp or self._status() == INACCURATE:
             return False
-        return gained or self._status() == GAINED or self.size < least
+        return gained or self._status() in (GAINED, IMPACT) or self.size < least
 
     def _damp(self, count: Callable[[], None], size: float, left: float, *, last: bool) -> bool:
         """Makes a part by the fallback; whether it is good. The last resort, which cannot be halved, may gain more."""

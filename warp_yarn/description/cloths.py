@@ -1,0 +1,103 @@
+"""Several cloths as one: what a scene takes that has more than one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import InputError
+from .cloth import CLOTH_NUMBERS, Cloth, Fixed
+from .topology import Topology, side_by_side
+
+APART = 1e3
+"""Times the largest cloth, by which cloths are apart where arcs along a cloth are compared: they may always touch."""
+
+
+class Cloths(Fixed):
+    """Cloths side by side, whose nodes are numbered on from one to the next.
+
+    They share what a scene has one number for (spacing, radius, shear, friction and so on), and have their own weaves,
+    sizes, poses and yarns.
+
+    Args:
+        cloths: at least one.
+
+    Attributes:
+        first_node: the first node of each cloth [cloths].
+    """
+
+    def __init__(self, cloths: Sequence[Cloth]):
+        if not isinstance(cloths, Sequence) or not cloths or not all(isinstance(cloth, Cloth) for cloth in cloths):
+            raise InputError(f"cloths = {cloths!r}, must be a list of at least one Cloth")
+        self.cloths = tuple(cloths)
+        for name in CLOTH_NUMBERS:
+            values = [getattr(cloth, name) for cloth in cloths]
+            if all(cloth._arguments[name] is None for cloth in cloths):
+                # what each has by default, of its own mass
+                values = [float(np.mean(values))] * len(cloths)
+            for k, value in enumerate(values):
+                if value != values[0]:
+                    raise InputError(
+                        f"cloths[{k}].{name} = {value:g} and cloths[0].{name} = {values[0]:g}, must be the same: "
+                        "a scene has one for all its cloths"
+                    )
+            setattr(self, name, values[0])
+        counts = np.array([cloth.nodes for cloth in cloths])
+        self.first_node = np.cumsum(counts) - counts
+        self.yarns = tuple(yarn for cloth in cloths for yarn in cloth.yarns)
+        kinds = np.cumsum([0, *(len(cloth.yarns) for cloth in cloths)])
+        self.material = np.concatenate([cloth.material + k for cloth, k in zip(cloths, kinds, strict=False)])
+        self.position = np.concatenate([cloth.position for cloth in cloths])
+        self.euler = np.concatenate([cloth.euler for cloth in cloths])
+        size = APART * max(np.abs(cloth.euler).max() for cloth in cloths)
+        self.rest_place = np.concatenate([cloth.euler + k * size for k, cloth in enumerate(cloths)])
+        self.topology: Topology = side_by_side([cloth.topology for cloth in cloths])
+        self._fix(cloths=self.cloths)
+
+    def __repr__(self) -> str:
+        return f"Cloths({', '.join(map(repr, self.cloths))})"
+
+    def same_as(self, other: Cloth | Cloths) -> bool:
+        """Whether another one is made of the same cloths, in the same order."""
+        return (
+            isinstance(other, Cloths)
+            and len(self.cloths) == len(other.cloths)
+            and all(mine.same_as(its) for mine, its in zip(self.cloths, other.cloths, strict=True))
+        )
+
+    @property
+    def nodes(self) -> int:
+        return len(self.position)
+
+    @property
+    def stretch_stiffness(self) -> np.ndarray:
+        """kₛ = Y π R² of every material [materials] (N)."""
+        return np.concatenate([cloth.stretch_stiffness for cloth in self.cloths])
+
+    def node(self, cloth: int, row: int, column: int) -> int:
+        """Index of a node of one of the cloths; negative rows and columns count from the end."""
+        if not isinstance(cloth, int | np.integer) or not 0 <= cloth < len(self.cloths):
+            raise InputError(f"cloth = {cloth!r}, must be from 0 to {len(self.cloths) - 1}")
+        return int(self.first_node[cloth]) + self.cloths[cloth].node(row, column)
+
+    def nodes_of(self, cloth: int) -> slice:
+        """Where the nodes of one of the cloths stand in arrays of nodes."""
+        first = self.node(cloth, 0, 0)
+        return slice(first, first + self.cloths[cloth].nodes)
+
+    def place(self, node: int) -> str:
+        """Where a node is, in words."""
+        k = int(np.searchsorted(self.first_node, node, side="right")) - 1
+        return f"cloth {k}, {self.cloths[k].place(node - int(self.first_node[k]))}"
+
+
+def as_one(cloth: Cloth | Cloths | Sequence[Cloth]) -> Cloth | Cloths:
+    """What a scene is made of: a cloth, or several."""
+    if isinstance(cloth, Cloth | Cloths):
+        return cloth
+    if isinstance(cloth, Sequence) and len(cloth) == 1 and isinstance(cloth[0], Cloth):
+        return cloth[0]
+    if isinstance(cloth, Sequence) and not isinstance(cloth, str):
+        return Cloths(cloth)
+    raise InputError(f"cloth = {cloth!r}, must be a Cloth, or a list of them")
