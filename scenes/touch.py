@@ -81,13 +81,13 @@ def rest(cloth: wy.Cloth) -> float:
     return 2.0 * cloth.radius * (1.0 + 1e-6)
 
 
-def scene(cloth: wy.Cloth, options: argparse.Namespace, **more: object) -> wy.Scene:
-    """A scene of a cloth that may touch itself."""
+def scene(cloth: wy.Cloth, options: argparse.Namespace, *others: wy.Cloth, **more: object) -> wy.Scene:
+    """A scene of cloths that may touch themselves and each other."""
     contact = wy.Contact(friction=options.friction)
     if options.seed is not None:
         aside = np.random.default_rng(options.seed).uniform(-0.01, 0.01, cloth.position.shape)
         cloth = cloth.replace(pose=cloth.position + cloth.spacing * aside)
-    return wy.Scene(cloth, sliding=not options.locked, self_contact=True, contact=contact, **more)
+    return wy.Scene([cloth, *others], sliding=not options.locked, self_contact=True, contact=contact, **more)
 
 
 def simulator(scene: wy.Scene, options: argparse.Namespace) -> wy.Simulator:
@@ -114,8 +114,10 @@ def finish(run: Run, options: argparse.Namespace, *told: str) -> wy.Trajectory:
     if options.mp4 is not None:
         writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
     write_all(trajectory, *writers)
-    weave = trajectory.cloth.weave
-    print(f"{weave.rows} × {weave.columns} yarns, {weave.name}: {len(trajectory)} frames, in {run.seconds:.2g} s")
+    cloth = trajectory.cloth
+    for weave in [each.weave for each in (cloth.cloths if isinstance(cloth, wy.Cloths) else [cloth])]:
+        print(f"{weave.rows} × {weave.columns} yarns, {weave.name}")
+    print(f"{len(trajectory)} frames, in {run.seconds:.2g} s")
     print(f"largest speed at the end: {1e3 * np.linalg.norm(trajectory.velocity[-1], axis=1).max():.3g} mm/s")
     for line in told:
         print(line)
@@ -176,7 +178,7 @@ def clearance(trajectory: wy.Trajectory) -> Clearance:
             local = each.local(trajectory.position[frame], frame)
             gap[frame] = min(gap[frame], distances(each, local).min())
     if trajectory.scene is not None and trajectory.scene.self_contact:
-        place = cloth.euler
+        place = cloth.rest_place
         along = np.linalg.norm(place[:, None] - place[None], axis=2)
         p, q = np.nonzero(np.triu(along >= 0.5 * np.pi * reach))
         for frame in range(frames if len(p) else 0):

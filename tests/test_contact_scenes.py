@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Usd, UsdGeom
 from scripts import exit_code, load
 
 import warp_yarn as wy
@@ -160,6 +160,19 @@ def test_a_seed_moves_the_start_a_little(usd):
     assert 5e-6 < np.abs(one - plain).max() <= 1e-5
 
 
+def test_a_cloth_is_pulled_from_under_another(usd):
+    """The upper one is taken along by no more than friction can, and lies on the lower one meanwhile."""
+    arguments = ["--beneath", "cloth", "--acceleration", 20, "--speed", 0.5, "--steps", 20]
+    made = pull.main(small(usd, *arguments, rows=9, columns=9))
+    lower, upper = (made.position[:, made.cloth.nodes_of(k)] for k in (0, 1))
+    pulled = (lower[-1] - lower[0])[-1, 1]
+    assert pulled == pytest.approx(0.5 * 20 * 0.02**2, rel=0.05)
+    went = (upper[-1] - upper[0])[:, 1].mean()
+    assert 0.0 < went < 0.5 * pulled
+    assert 2.0e-3 < (upper[-1, :, 2].mean() - lower[-1, :, 2].mean()) < 2.6e-3
+    assert touch.clearance(made).apart.min() > 1.5e-3
+
+
 def test_the_way_of_a_tray_is_of_its_acceleration():
     t = np.linspace(0, 0.2, 2001)
     way = pull.way(20.0, 1.0, t)
@@ -250,6 +263,29 @@ def test_a_recording_goes_on_with_its_obstacles(tmp_path, law):
     simulator = wy.Simulator(first.scene, step=first.step)
     simulator.state, simulator.steps_done = first[-1], first.steps_done
     assert first.joined(simulator.run(3)) == whole
+
+
+@pytest.mark.parametrize("fabric", ["paper", "handkerchief"])
+def test_a_recording_has_several_cloths(tmp_path, fabric):
+    """Handkerchief's friction damping is of each cloth's mass."""
+    make = wy.fabrics.FABRICS[fabric]
+    below, above = make(rows=4, columns=5, weave="twill", pose="flat"), make(rows=3, columns=4, pose="flat")
+    below = below.replace(yarns=[wy.Yarn(density=1e-3, stretch=1e5, bend=1e-4), *below.yarns])
+    above = above.replace(pose=above.position + 2.6e-3 * np.array([0, 0, 1]))
+    scene = wy.Scene([below, above], self_contact=True, obstacles=[wy.Plane(point=(0, 0, -1e-3), normal=(0, 0, 1))])
+    whole = wy.Simulator(scene).run(4)
+    wy.Simulator(scene).run(2).save(tmp_path / "a.npz")
+    first = wy.Trajectory.load(tmp_path / "a.npz")
+    assert first.scene.same_as(scene) and len(first.cloth.cloths) == 2
+    simulator = wy.Simulator(first.scene, step=first.step)
+    simulator.state, simulator.steps_done = first[-1], first.steps_done
+    assert first.joined(simulator.run(2)) == whole
+    # each material of either cloth has its prim, of as many yarns
+    wy.write_usd(tmp_path / "a.usdc", whole)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    yarns = stage.GetPrimAtPath("/cloth").GetChildren()
+    counts = [len(UsdGeom.BasisCurves(prim).GetCurveVertexCountsAttr().Get()) for prim in yarns]
+    assert sum(counts) == 4 + 5 + 3 + 4 and len(counts) == len(np.unique(scene.cloth.material))
 
 
 def test_a_recording_of_before_contact_is_read(tmp_path):
