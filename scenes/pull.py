@@ -19,8 +19,11 @@ import touch
 from common import command
 
 import warp_yarn as wy
+from warp_yarn.errors import whole
 
 GRAVITY = 9.8
+SMALLER = 6
+"""Yarns either way that the upper cloth has less than the lower one."""
 LAYERS = 2.5
 """Of the upper cloth over the lower one, in spacings: where they touch, but hardly."""
 
@@ -34,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def way(acceleration: float, speed: float, time: np.ndarray) -> np.ndarray:
-    """How far the tray has moved [m]: steadily faster, then steadily."""
+    """How far what is beneath has moved [m]: steadily faster, then steadily."""
     until = speed / acceleration
     return np.where(time < until, 0.5 * acceleration * time**2, speed * (time - 0.5 * until))
 
@@ -59,8 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         tray = wy.Box(center=center, half_extents=half, friction=options.friction, path=center + along)
         made = touch.run(touch.scene(touch.raised(cloth, high), options, obstacles=[floor, tray]), options)
     else:
+        for name in ("rows", "columns"):
+            whole(f"--{name} of a cloth beneath another", getattr(options, name), least=SMALLER + 3)
         lower = touch.raised(cloth, 0.0)
-        smaller = argparse.Namespace(**{**vars(options), "rows": options.rows - 6, "columns": options.columns - 6})
+        fewer = {"rows": options.rows - SMALLER, "columns": options.columns - SMALLER}
+        smaller = argparse.Namespace(**{**vars(options), **fewer})
         upper = touch.raised(touch.flat(smaller), LAYERS * cloth.spacing)
         pins = [lower.node(-1, column) for column in range(options.columns)]
         path = lower.position[pins] + along[:, None]
@@ -70,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
 
 
 def shares(trajectory: wy.Trajectory, moved: np.ndarray, options: argparse.Namespace) -> str:
-    """How far the cloth went with the tray."""
+    """How far the cloth went with what was beneath it."""
     upper = trajectory.cloth.nodes_of(1) if isinstance(trajectory.cloth, wy.Cloths) else slice(None)
     went = (trajectory.position[-1] - trajectory.position[0])[upper, 1].mean()
     of = moved[len(trajectory) - 2] if len(trajectory) > 1 else 0.0

@@ -212,6 +212,7 @@ def test_layers_of_a_stack_settle_two_and_a_half_spacings_apart(usd, capsys):
         (drape, ["--steps", "0"], "--steps = 0"),
         (fold, ["--fold", "0"], "--fold = 0"),
         (pull, ["--speed", "0"], "--speed"),
+        (pull, ["--beneath", "cloth", "--columns", "8"], "--columns of a cloth beneath another = 8"),
         (pull, ["--acceleration", "fast"], "--acceleration"),
         (stack, ["--layers", "1"], "--layers = 1"),
         (stack, ["--columns", "2"], "--columns = 2"),
