@@ -74,7 +74,7 @@ class Trajectory:
     ``simulator.steps_done = trajectory.steps_done``.
     """
 
-    cloth: Cloth
+    cloth: Cloth | Cloths
     step: float
     """Time from frame to frame [s]."""
     position: np.ndarray

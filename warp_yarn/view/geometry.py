@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..description.cloth import Cloth
+from ..description.cloths import Cloths
 from ..description.obstacles import Obstacle, TriangleMesh
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..errors import InputError, finite_array
@@ -267,7 +268,7 @@ def checked(trajectory: Trajectory) -> np.ndarray:
     return position
 
 
-def contact_normals(cloth: Cloth, position: np.ndarray) -> np.ndarray:
+def contact_normals(cloth: Cloth | Cloths, position: np.ndarray) -> np.ndarray:
     """Unit normal from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
     topology, device = cloth.topology, wp.get_device("cpu")
     with ALONE, compiling():
