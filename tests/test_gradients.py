@@ -399,7 +399,7 @@ def made_with(name: str, value: float) -> None:
         cloth(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["density", "stretch", "bend", *NUMBERS])
+@pytest.mark.parametrize("name", ["density", "stretch", "bend", *(name for name in NUMBERS if "contact" not in name)])
 @pytest.mark.parametrize("value", [-1e-4, -0.0, 0.0, 1e-3, float("inf")])
 def test_tensors_have_the_ranges_of_numbers(name: str, value: float) -> None:
     rollout = wt.Rollout(scene_for("plain", 1), 1, integrator="linear")

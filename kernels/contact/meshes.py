@@ -65,7 +65,6 @@ def define(variant: Variant) -> wp.Kernel:
         velocity: wp.array(dtype=vec3),
         increment: wp.array(dtype=vec3),
         step_size: wp.array(dtype=scalar),
-        evaluations: wp.array(dtype=int),
         # forces out, and whether anything touches
         force: wp.array(dtype=vec3),
         touching: wp.array(dtype=int),
@@ -87,7 +86,7 @@ def define(variant: Variant) -> wp.Kernel:
                 wp.atomic_add(force, i, contact_force(law, friction, at[3], n, v))
                 note_contact(law, n, v, increment[i], step_size[0], touching)
                 if matrix != 0:
-                    xx = contact_matrix(law, friction, at[3], n, v, blocks.coefficients[0], evaluations[0])
+                    xx = contact_matrix(law, friction, at[3], n, v, blocks.coefficients[0], blocks.evaluations[0])
                     wp.atomic_add(blocks.diagonal_xx, i, xx)
 
     return mesh_term

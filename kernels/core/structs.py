@@ -20,11 +20,13 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class BlockMatrix:
-        """The matrix (``linear/block_matrix.py`` tells its layout), and what M, D and H are multiplied by in it."""
+        """The matrix (``linear/block_matrix.py`` tells its layout), what M, D and H are multiplied by in it, and how
+        many evaluations there were in the stage: where Newton's iteration goes to and fro, terms fill it otherwise."""
 
         stencil: int
         neighbour: wp.array(dtype=int)
         coefficients: wp.array(dtype=vec3)
+        evaluations: wp.array(dtype=int)
         diagonal_xx: wp.array(dtype=mat33)
         diagonal_xs: wp.array(dtype=vec3)
         diagonal_ss: wp.array(dtype=scalar)
