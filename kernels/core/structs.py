@@ -1,7 +1,7 @@
 """Arrays that kernels take together, as one argument.
 
-A field is found by its name, as an argument is (``warp_yarn/device/declared.py``), at every launch anew: Warp keeps what
-an array and its gradient were when it was put into a struct. What a scene does not have is an array of no length.
+A field is found by its name, as an argument is (``warp_yarn/device/declared.py``), at every launch anew: Warp keeps
+what an array and its gradient were when it was put into a struct. What a scene does not have is an array of no length.
 """
 
 import functools
