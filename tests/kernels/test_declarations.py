@@ -104,6 +104,10 @@ def test_what_is_not_declared_cannot_be_set():
     arrays = wy.Simulator(scene("plain", ("stretch",))).arrays
     with pytest.raises(KeyError, match="positoin"):
         arrays["positoin"] = arrays["position"]
+    with pytest.raises(KeyError, match="positoin"):
+        arrays.update(positoin=arrays["position"])
+    with pytest.raises(KeyError, match="positoin"):
+        arrays.setdefault("positoin", arrays["position"])
     with pytest.raises(TypeError, match="position"):
         arrays["position"] = arrays["euler"]
     with pytest.raises(TypeError, match="position"):

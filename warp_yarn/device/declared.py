@@ -1,5 +1,6 @@
 """Arrays by the names that kernels have for them: made, set, cleared and launched with as they are declared."""
 
+import collections
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ LARGE = 1 << 20
 """Bytes of an array."""
 
 
-class DeclaredArrays(dict[str, Any]):
+class DeclaredArrays(collections.UserDict[str, Any]):
     """Arrays of a variant on a device.
 
     Args:
