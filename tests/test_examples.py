@@ -236,7 +236,7 @@ def test_it_can_be_learned(drag: ModuleType) -> None:
     target = wy.Simulator(scene, newton_tolerance=1e-10).run(10)
     assert wl.value_of(scene, "linear_drag") == C
     model = hung(parameters={"linear_drag": 0.5 * C})
-    task = wl.Task(model, target, [wl.Parameter("linear_drag", 0.0, 3.0 * C, 0.5 * C)], frames=6)
+    task = wl.CalibrationProblem(model, target, [wl.Parameter("linear_drag", 0.0, 3.0 * C, 0.5 * C)], frames=6)
     # it began 50 % off; 5e-5 were seen, where the search stops
     assert wl.learn(task).values["linear_drag"] == pytest.approx(C, rel=1e-3)
     layer = wt.Fabric(scene, 4, learn={"linear_drag": (0.0, 1.0)})
@@ -465,6 +465,60 @@ def reading(name: str, dtype: Any = None) -> Callable[[wy.Variant], wp.Kernel]:
     return define
 
 
+def writing(what: str) -> Callable[[wy.Variant], wp.Kernel]:
+    """A term's ``define`` whose kernel uses the matrix: a damping, or what is above the diagonal."""
+
+    def define(variant: wy.Variant) -> wp.Kernel:
+        scalar, mat33, BlockMatrix = variant.scalar, variant.mat33, structs(variant).BlockMatrix
+
+        @wp.func
+        def factor(to: BlockMatrix) -> scalar:
+            return to.coefficients[0][1]
+
+        @wp.func
+        def twice(to: BlockMatrix) -> scalar:
+            return scalar(2.0) * factor(to)
+
+        @wp.func
+        def couple(to: BlockMatrix, k: int):
+            to.upper_xx[k] = mat33(scalar(0.0))
+
+        @variant.kernel("terms")
+        def damping_kernel(blocks: BlockMatrix):
+            blocks.diagonal_xx[0] = mat33(blocks.coefficients[0][1])
+
+        @variant.kernel("terms")
+        def all_factors_kernel(blocks: BlockMatrix):
+            factors = blocks.coefficients[0]
+            blocks.diagonal_xx[0] = mat33(factors[1])
+
+        @variant.kernel("terms")
+        def damping_by_a_function_kernel(blocks: BlockMatrix):
+            blocks.diagonal_xx[0] = mat33(twice(blocks))
+
+        @variant.kernel("terms")
+        def upper_kernel(blocks: BlockMatrix):
+            blocks.upper_xx[0] = mat33(blocks.coefficients[0][2])
+
+        @variant.kernel("terms")
+        def upper_by_a_function_kernel(blocks: BlockMatrix):
+            couple(blocks, 0)
+
+        return locals()[f"{what}_kernel"]
+
+    return define
+
+
+def taking_a_solvers_work(variant: wy.Variant) -> wp.Kernel:
+    SolverWork = structs(variant).SolverWork
+
+    @variant.kernel("terms")
+    def kernel(blocks: SolverWork):
+        blocks.sums[0] = variant.scalar(0.0)
+
+    return kernel
+
+
 PARAMETER = wy.TermParameter("tether", "N/m")
 BAD = {
     "no term": (lambda: "tether", "must be a Term"),
@@ -500,6 +554,12 @@ BAD = {
     "another's argument": ({"define": reading("path"), "energy": None}, "'path', must be one of"),
     "friction's": ({"define": reading("anchor"), "energy": None}, "'anchor', must be one of"),
     "blocks": ({"define": reading("upper_xx"), "energy": None}, "stencil = 0, must be at least 2"),
+    "blocks in a struct": ({"define": writing("upper"), "energy": None}, "stencil = 0, must be at least 2"),
+    "blocks by a function": ({"define": writing("upper_by_a_function"), "energy": None}, "must be at least 2"),
+    "a damping": ({"define": writing("damping"), "energy": None}, "explicit_in_ros2=True"),
+    "all factors": ({"define": writing("all_factors"), "energy": None}, "explicit_in_ros2=True"),
+    "a damping by a function": ({"define": writing("damping_by_a_function"), "energy": None}, "explicit_in_ros2=True"),
+    "another struct": ({"define": taking_a_solvers_work, "energy": None}, "must be one of .* or blocks: BlockMatrix"),
     "blocks of triangles": ({"define": reading("triangle_blocks"), "energy": None, "stencil": 4}, "at least 6"),
     "normal": ({"define": reading("normal"), "energy": None}, "needs_contact=True"),
     "load": ({"define": reading("contact_load"), "energy": None}, "needs_contact=True or presses=True"),

@@ -207,7 +207,8 @@ def _check_kernel(term: Term, kernel: Any) -> None:
 
 def _source(kernel: wp.Kernel) -> str:
     """Collect the source of a kernel and of the Warp functions that it calls, and they call."""
-    found, waiting = {}, [kernel]
+    found: dict[Any, str] = {}
+    waiting: list[Any] = [kernel]
     while waiting:
         part = waiting.pop()
         if part not in found:

@@ -165,7 +165,8 @@ class DeclaredArrays(collections.UserDict[str, Any]):
 
     def taken(self, kernel: wp.Kernel, **offered: Any) -> dict[str, Any]:
         """Choose what a kernel has arguments for."""
-        return {name: value for name, value in offered.items() if name in arguments(kernel)}
+        known = arguments(kernel)
+        return {name: value for name, value in offered.items() if name in known}
 
     def _argument(self, label: str, kind: Any, replaced: dict[str, Any]) -> Any:
         """Find what a kernel's argument is launched with; the fields of a struct are found as arguments are."""

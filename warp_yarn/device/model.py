@@ -5,7 +5,6 @@ What a time step is made of, without saying how: that is for ``integrators``.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from typing import Any
 
@@ -22,7 +21,7 @@ from .declared import arguments
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
 from .inputs import Inputs
-from .threads import Threads
+from .threads import SOLVED, Threads
 
 MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
@@ -30,8 +29,6 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
-"""What differs from one linear solve to another."""
 
 
 class Model:
@@ -206,10 +203,6 @@ class Model:
         kernel = f"{self.preconditioner}_conjugate_gradient"
         options = {} if self.preconditioner == "jacobi" else {"thread": thread}
         self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
-
-    def threads_at_hand(self) -> contextlib.AbstractContextManager[None]:
-        """Keep other processor cores at hand for linear solves, for as long as a block lasts."""
-        return self.threads.at_hand(SOLVED)
 
     def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
