@@ -175,7 +175,7 @@ def test_chart_1_from_the_command(monkeypatch, tmp_path, capsys):
 # -- benchmarks/motions.py --------------------------------------------------------------------------------------------
 
 MOTIONS = ("hung", "snap", "pull", "throw", "drop", "strip", "carried")
-EXACT = references.EXACT
+EXACT = {"tolerance": 1e-12, "newton_tolerance": 1e-9}
 """Tolerances near rounding."""
 norm = np.linalg.norm
 

@@ -199,6 +199,12 @@ def test_damped_steps_are_interrupted_anywhere():
 
 def test_a_team_is_interrupted_anywhere():
     """Its helpers end, and others take their place."""
+
+    def helpers() -> int:
+        # threads of Warp's and of locks, which Python counts for ever once it has seen them, are of another class
+        return sum(type(thread) is threading.Thread for thread in threading.enumerate())
+
+    before = helpers()
     wide = wy.paper.hung_cloth("plain", 3, 16)
     sim = wy.Simulator(wide, threads=2)
     whole = sim.run(3)
@@ -212,9 +218,9 @@ def test_a_team_is_interrupted_anywhere():
                 sim.run(3)
         except _Stop:
             check_goes_on(sim, whole)
-        assert threading.active_count() < 20
+        assert helpers() < before + 20
     sim.reset()
-    assert threading.active_count() < 6 and same(sim.run(3), whole)
+    assert helpers() <= before + 1 and same(sim.run(3), whole)
 
 
 @pytest.mark.parametrize("call", ["state", "energy", "forces", "contact", "system", "reset", "deepcopy"])

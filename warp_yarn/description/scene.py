@@ -138,7 +138,7 @@ class Scene(Fixed):
         return {parameter.name: parameter for term in terms if not own(term) for parameter in term.parameters}
 
     def registered_value(self, name: str) -> np.ndarray:
-        """The value of one of ``registered``, given or by default: (), a vector (3), or of every material [yarns]."""
+        """Finds a value of ``registered``, given or by default: (), a vector (3), or of every material [yarns]."""
         parameter = self.registered[name]
         value = np.array(self._parameters.get(name, parameter.default), dtype=np.float64)
         return np.broadcast_to(value, (len(self.cloth.yarns),)) if parameter.of == "yarn" else value
@@ -222,7 +222,7 @@ class Scene(Fixed):
         return tuple(name for name in known if name in names or name == "mass")
 
     def _lacks(self, term: Term) -> str:
-        """Why the scene has no use for a term, or ""."""
+        """Says why the scene has no use for a term, or ""."""
         if term.sliding_only and not self.sliding:
             return "yarns do not slide (sliding=False)"
         for parameter in () if own(term) else term.parameters:
@@ -231,7 +231,7 @@ class Scene(Fixed):
         return term.absent(self) if term.absent is not None else ""
 
     def _checked_parameters(self, given: Any) -> dict[str, Any]:
-        """{name: value}, as ``checked_parameter`` leaves it."""
+        """Checks {name: value}, each as ``checked_parameter`` leaves it."""
         if given is None:
             return {}
         if not isinstance(given, Mapping):
@@ -252,7 +252,7 @@ class Scene(Fixed):
 
 
 def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> Any:
-    """A value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
+    """Checks a value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
     if parameter.size == 3:
         return tuple(finite_array(parameter.name, value, (3,)).tolist())
     if parameter.of == "yarn" and not np.isscalar(value):

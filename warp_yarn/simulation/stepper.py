@@ -150,7 +150,7 @@ class Stepper:
                 refuse_recording(self.model.device)
                 self.settle()
                 if self.model.threads.count > 1:
-                    uninterrupted(lambda: self._team.enter_context(self.model.threads_at_hand()))
+                    uninterrupted(lambda: self._team.enter_context(self.model.threads.at_hand()))
             return self._make_steps(steps)
         finally:
             self._end_team()
