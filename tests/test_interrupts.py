@@ -121,7 +121,7 @@ def test_a_run_is_interrupted_anywhere(name):
     assert stopped > 100
 
 
-@pytest.mark.parametrize("integrator", quick(INTEGRATORS, "linear", "sdirk2"))
+@pytest.mark.parametrize("integrator", quick(INTEGRATORS, "linear"))
 def test_the_first_step_is_interrupted_anywhere(integrator):
     """While its graph is captured: no capture stays open."""
     whole = simulator(integrator=integrator).run(2)
@@ -197,6 +197,7 @@ def test_damped_steps_are_interrupted_anywhere():
     assert sim.damped_steps == set() and sim.substepping.damped == 0
 
 
+@pytest.mark.slow
 def test_a_team_is_interrupted_anywhere():
     """Its helpers end, and others take their place."""
 
@@ -462,7 +463,7 @@ def check_equal(found: object, expected: object) -> None:
         assert np.array_equal(found, expected)
 
 
-@pytest.fixture(scope="module", params=["sdirk2", "linear", "short chunks", "step_error"])
+@pytest.fixture(scope="module", params=quick(["sdirk2", "linear", "short chunks", "step_error"], "short chunks"))
 def pair(request) -> Pair:
     return Pair(**OPTIONS[request.param])
 

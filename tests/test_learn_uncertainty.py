@@ -133,6 +133,7 @@ def test_a_step_that_cannot_be_halved_leaves_its_part_unknown(data, monkeypatch)
 # -- benchmarks/uncertainty.py: real yarns, and yarns that ring -------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fabric", "pose", "of", "seeds"),
     [("paper", "saddle", ("same", "finer"), 3), ("handkerchief", "flat", ("same",), 2)],
