@@ -397,7 +397,7 @@ def test_the_passes_have_every_array_of_the_iteration(preconditioner):
     # where several threads meet
     once |= {"signals", "sums"}
     # what the terms read alone, and the diagonal's conjugate gradient has no use for
-    once |= {"coefficients"} | ({"t_x", "t_s"} if preconditioner == "jacobi" else set())
+    once |= {"coefficients", "evaluations"} | ({"t_x", "t_s"} if preconditioner == "jacobi" else set())
     counted = {name for read, written in bandwidth.PASSES[preconditioner] for name in f"{read} {written}".split()}
     assert counted == arrays - once
 

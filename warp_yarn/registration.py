@@ -35,7 +35,8 @@ OF_STEPS = {"pin_target_path", "pin_start", "pin_motion", "applied_force_path"}
 """What becomes an input of a step."""
 OF_THE_SYSTEM = {"rhs", "euler_rhs", "solution", "euler_solution"}
 """What is made of what all terms write."""
-FOR_TERMS = {*TOPOLOGY, *PARAMETERS, *INPUTS, *STATE, *ASSEMBLY, "coefficients", "energy", "matrix", "add_contact_load"}
+FOR_TERMS = {*TOPOLOGY, *PARAMETERS, *INPUTS, *STATE, *ASSEMBLY, "coefficients"}
+FOR_TERMS |= {"evaluations", "energy", "matrix", "add_contact_load"}
 FOR_TERMS -= OF_FRICTION | OF_STEPS | OF_THE_SYSTEM
 """What kernels of a term from outside the package may take, beside their parameters."""
 METHOD = ("name", "order", "fallback", "local_error", "set_times", "advance", "prepare_adjoint", "backward_step")

@@ -14,17 +14,8 @@ from warp_yarn.device.declared import Struct
 from warp_yarn.device.fields import Field
 
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
-STRUCTS = {
-    "BlockMatrix",
-    "SolverWork",
-    "SolveReport",
-    "NewtonControl",
-    "StateAdjoint",
-    "Levels",
-    "Pairs",
-    "Obstacles",
-    "Faces",
-}
+STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAdjoint", "Levels"}
+STRUCTS |= {"Pairs", "Obstacles", "Faces"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
 """Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""

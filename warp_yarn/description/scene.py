@@ -92,9 +92,9 @@ class Scene(Fixed):
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
-        checked = self._checked_forces(forces)
+        checked = _checked_forces(forces)
         self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
-        self.force_path = self._force_path(checked)
+        self.force_path = _force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
         self._parameters = self._checked_parameters(parameters)
@@ -179,33 +179,6 @@ class Scene(Fixed):
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
 
-    @staticmethod
-    def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
-        """Gives {node: 3 numbers, or steps × 3}."""
-        if forces is None:
-            return {}
-        if not isinstance(forces, Mapping):
-            raise InputError(f"forces = {forces!r}, must be a dictionary, {{node: 3 numbers, or steps × 3}}")
-        result = {}
-        for node, value in forces.items():
-            name = f"forces[{node!r}]"
-            try:
-                steps = np.ndim(value) == 2
-            except ValueError as error:  # ragged
-                raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
-            result[node] = finite_array(name, value, (None, 3) if steps else (3,))
-            result[node].setflags(write=False)
-        return result
-
-    @staticmethod
-    def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
-        """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
-        steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
-        path = np.zeros((steps + 1, len(forces), 3))
-        for k, value in enumerate(forces.values()):
-            path[: len(value) if value.ndim == 2 else steps + 1, k] = value
-        return path
-
     def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
         if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
             raise InputError(f"terms = {names!r}, must be a list of names")
@@ -259,3 +232,30 @@ def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> A
         values = finite_array(parameter.name, value, (materials,)).tolist()
         return tuple(real(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
     return real(parameter.name, value, **parameter.range)
+
+
+def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
+    """Gives {node: 3 numbers, or steps × 3}."""
+    if forces is None:
+        return {}
+    if not isinstance(forces, Mapping):
+        raise InputError(f"forces = {forces!r}, must be a dictionary, {{node: 3 numbers, or steps × 3}}")
+    result = {}
+    for node, value in forces.items():
+        name = f"forces[{node!r}]"
+        try:
+            steps = np.ndim(value) == 2
+        except ValueError as error:  # ragged
+            raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
+        result[node] = finite_array(name, value, (None, 3) if steps else (3,))
+        result[node].setflags(write=False)
+    return result
+
+
+def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
+    """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
+    steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
+    path = np.zeros((steps + 1, len(forces), 3))
+    for k, value in enumerate(forces.values()):
+        path[: len(value) if value.ndim == 2 else steps + 1, k] = value
+    return path

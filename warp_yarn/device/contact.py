@@ -9,6 +9,7 @@ import warp as wp
 
 from ..description.obstacles import TriangleMesh
 from ..description.scene import Scene
+from ..errors import InputError
 from ..kernels.contact import distances
 from . import declarations
 from .energy_watch import AT_START
@@ -149,6 +150,8 @@ class Contact:
         self._tapes: dict[int, wp.Tape] = {}
         self.has_mesh = any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
         if self.self_contact:
+            if model.preconditioner == "jacobi":
+                raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
             a, cloth = model.arrays, scene.cloth
             self._reach = float(a["self_contact_distance"].numpy()[0] + a["self_contact_range"].numpy()[0])
             side = int(np.clip(np.sqrt(cloth.nodes) * cloth.spacing / self._reach, 8, 128))

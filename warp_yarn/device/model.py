@@ -71,8 +71,6 @@ class Model:
         if preconditioner is None:
             preconditioner = defaults.preconditioner(scene, self.step_size)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
-        if scene.self_contact and preconditioner == "jacobi":
-            raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
         exact = differentiable and precision == "double"
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
@@ -102,9 +100,8 @@ class Model:
 
     def newton_tolerance_at(self, step: float) -> float:
         """Give the tolerance that was asked for, or what follows the error of steps of this size [s]."""
-        if self._newton_tolerance is not None:
-            return self._newton_tolerance
-        return defaults.newton_tolerance(self.scene, self.precision, step)
+        given = self._newton_tolerance
+        return defaults.newton_tolerance(self.scene, self.precision, step) if given is None else given
 
     def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
         """Sets the times of the step that kernels make.

@@ -221,7 +221,7 @@ def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
 
 
 def _linear(color: Sequence[float]) -> Gf.Vec3f:
-    """displayColor is linear; the colours of yarns are those of a screen (sRGB)."""
+    """Makes a displayColor, which is linear, of a colour; those of yarns are those of a screen (sRGB)."""
     from pxr import Gf
 
     screen = np.array(color, dtype=np.float64)

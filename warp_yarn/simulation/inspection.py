@@ -106,6 +106,8 @@ class Inspection:
             InputError: the two places that are nearest, and how near.
         """
         contact, place = self.model.contact, self.model.scene.cloth.place
+        if not contact.on:
+            return
         with _Visit(self.stepper, state):
             found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move

@@ -191,7 +191,7 @@ class Trajectory:
 
 
 def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
-    """A cloth as arrays; of several each with its number before their names."""
+    """Packs a cloth into arrays; of several each with its number before their names."""
     if isinstance(cloth, Cloths):
         parts = [_packed_cloths(each) for each in cloth.cloths]
         return {"cloths": len(parts)} | {
@@ -213,7 +213,7 @@ def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
 
 
 def _unpacked_cloths(data: Any) -> Cloth | Cloths:
-    """What ``_packed_cloths`` made arrays of."""
+    """Makes what ``_packed_cloths`` made arrays of."""
     if "cloths" in data:
         count = integer("cloths", data["cloths"].item(), least=1)
         return Cloths([_unpacked_cloth(data, f"cloth_{k}_") for k in range(count)])
@@ -290,7 +290,7 @@ def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
 
 
 def _unpacked_obstacles(data: Any) -> list[Obstacle]:
-    """In recordings of before there are none."""
+    """Makes the obstacles, of which recordings of before have none."""
     shapes = data["scene_obstacles"].tolist() if "scene_obstacles" in data else []
     return [
         SHAPES[choice("obstacles", shape, SHAPES)](**_arguments(data, f"obstacle_{k}"))
@@ -299,7 +299,7 @@ def _unpacked_obstacles(data: Any) -> list[Obstacle]:
 
 
 def _arguments(data: Any, group: str) -> dict[str, Any]:
-    """What something was made of: arrays, and numbers and names as such; NaN is None."""
+    """Gives what something was made of: arrays, and numbers and names as such; NaN is None."""
     start = f"scene_{group}_"
     found = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
     values = {name: array if array.ndim else array.item() for name, array in found.items()}

@@ -152,7 +152,7 @@ class Placed:
         return bool((self.position != self.position[0]).any() or (self.rotation != self.rotation[0]).any())
 
     def world(self, points: np.ndarray) -> np.ndarray:
-        """Points of the obstacle's own frame [points, 3] at every frame [frames, points, 3]."""
+        """Takes points of the obstacle's own frame [points, 3] at every frame [frames, points, 3]."""
         return self.position[:, None] + _turned(self.rotation[:, None], points[None])
 
     def local(self, points: np.ndarray, frame: int) -> np.ndarray:
@@ -160,14 +160,14 @@ class Placed:
         return _turned(self.rotation[frame] * BACK, points - self.position[frame])
 
     def matrix(self, frame: int) -> np.ndarray:
-        """[4, 4]: from its own frame to the world."""
+        """Makes the matrix [4, 4] from its own frame to the world."""
         result = np.eye(4)
         result[:3, :3] = _turned(self.rotation[frame], np.eye(3)).T
         result[:3, 3] = self.position[frame]
         return result
 
     def corners(self) -> np.ndarray:
-        """Of a box around it in its own frame [8, 3] (m); of a plane, of its rectangle [4, 3]."""
+        """Gives the corners of a box around it in its own frame [8, 3] (m); of a plane, of its rectangle [4, 3]."""
         obstacle = self.obstacle
         low, high = np.zeros(3), np.zeros(3)
         if obstacle.shape == "plane":
@@ -187,7 +187,7 @@ class Placed:
 
 
 def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]:
-    """The obstacles of a trajectory's scene.
+    """Lists the obstacles of a trajectory's scene.
 
     Args:
         at: when its frames are, in steps since the first frame of the run [frames], which need not be whole; None: 0,
@@ -212,7 +212,7 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
 
 
 def _poses(obstacle: Obstacle, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose after so many steps: at constant velocity and spin from the end of one to that of the next."""
+    """Computes poses after so many steps: at constant velocity and spin from the end of one to that of the next."""
     path = np.append(obstacle.position, obstacle.rotation)[None]
     if obstacle.path is not None:
         path = np.concatenate([path, obstacle.path])
@@ -233,7 +233,7 @@ def _poses(obstacle: Obstacle, steps: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _turned(q: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points turned by quaternions (x, y, z, w)."""
+    """Gives points turned by quaternions (x, y, z, w)."""
     twice = 2.0 * np.cross(q[..., :3], points)
     return points + q[..., 3:] * twice + np.cross(q[..., :3], twice)
 

@@ -227,7 +227,7 @@ class _Camera:
         return cls(axes, centre, distance, (max(distance - reach, 0.01 * distance), distance + reach))
 
     def clipping_with(self, points: np.ndarray, radius: float) -> tuple[float, float]:
-        """How near and far it sees, to have points in the picture that it was not framed for."""
+        """Sets how near and far it sees, to have points in the picture that it was not framed for."""
         depth = self.distance - (points @ self.axes[2] - self.centre[2])
         near = max(depth.min() - 2.0 * radius, 0.01 * self.distance)
         return min(self.clipping[0], near), max(self.clipping[1], depth.max() + 2.0 * radius)
@@ -238,14 +238,14 @@ class _Camera:
 
 
 def _surroundings(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The box [3], [3] (m) in which obstacles are to be in view, about all that is drawn of the yarns."""
+    """Finds the box [3], [3] (m) in which obstacles are to be in view, about all that is drawn of the yarns."""
     low, high = points.min(axis=0), points.max(axis=0)
     more = SURROUNDINGS * (high - low).max()
     return low - more, high + more
 
 
 def _surface(pv: Any, placed: Placed) -> Any:
-    """An obstacle in its own frame, as a mesh of PyVista."""
+    """Makes an obstacle in its own frame, as a mesh of PyVista."""
     obstacle, axis = placed.obstacle, (0.0, 0.0, 1.0)
     if isinstance(obstacle, TriangleMesh):
         return pv.PolyData(obstacle.vertices, faces=np.insert(obstacle.faces, 0, 3, axis=1))
@@ -263,7 +263,7 @@ def _surface(pv: Any, placed: Placed) -> Any:
 
 
 def _times(frames: int, apart: float) -> np.ndarray:
-    """0, apart, 2 apart, ... up to the last frame."""
+    """Lists 0, apart, 2 apart, ... up to the last frame."""
     # Where a picture falls on the last frame, rounding must not lose it.
     return np.arange(np.floor((frames - 1) / apart + 1e-9) + 1.0) * apart
 
