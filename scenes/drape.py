@@ -1,7 +1,7 @@
 """A cloth is dropped onto something, and drapes over it.
 
 python scenes/drape.py                                    the paper's, over a sphere: out/drape.usdc
-python scenes/drape.py --over torus --weave satin --integrator sdirk2 --png out/drape.png
+python scenes/drape.py --over torus --weave satin --png out/drape.png
 python scenes/drape.py --over table --fabric handkerchief --rows 41 --columns 41
 python scenes/drape.py --mesh bunny.obj --scale 0.1       any file that trimesh reads, in metres times the scale
 
