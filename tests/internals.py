@@ -51,6 +51,17 @@ def strips(simulator: wy.Simulator) -> int:
     return simulator.model.threads.count
 
 
+def solve(simulator: wy.Simulator, force: np.ndarray) -> np.ndarray:
+    """Solves M v = h F, from v = 0, with the method's conjugate gradient; gives what is found of v."""
+    simulator.system(simulator.state, weights=(1.0, 0.0, 0.0))
+    put(simulator, "rhs", simulator.step_size * force)
+    simulator.arrays.zero("euler_rhs", "solution", "euler_solution")
+    simulator.model.factorize()
+    with simulator.model.threads.at_hand():
+        simulator.model.solve()
+    return numbers(simulator, "solution")
+
+
 # -- steps ------------------------------------------------------------------------------------------------------------
 
 
