@@ -3,9 +3,9 @@
 python benchmarks/contact_sizes.py                                   two sheets of 17² to 100² nodes: some minutes
 python benchmarks/contact_sizes.py --sizes 223 --steps 3             10⁵ nodes
 
-Two sheets of the paper's cloth, one on a plane and one on the other, implicit Euler, 1 ms: time of a step beside that of
-the same sheets free of all and at rest, which is the cheapest step there is, in turns; what of it goes to looking for
-what is near and to evaluating contact; memory of contact for a node. Writes benchmarks/results/contact_sizes.csv.
+Two sheets of the paper's cloth, one on a plane and one on the other, implicit Euler, 1 ms: time of a step beside that
+of the same sheets free of all and at rest, which is the cheapest step there is, in turns; what of it goes to looking
+for what is near and to evaluating contact; memory of contact for a node. Writes benchmarks/results/contact_sizes.csv.
 """
 
 from __future__ import annotations
