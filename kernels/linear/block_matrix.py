@@ -10,9 +10,9 @@ couples positions alone. A slot that a scene's terms do not fill is not stored (
     diagonal_ss [2·node + d]  1        upper_sx [4·node + slot]        3       row s of node, column x of neighbour
                                        upper_ss [4·node + slot]        1
 
-Two preconditioners P. Here the diagonal of A (``jacobi``): every node on its own, so it is what a parallel machine
-wants. In ``incomplete.py`` one that takes a twelfth of the iterations, node after node, and in
-``conjugate_gradient.py`` the iteration with it.
+Three preconditioners P. Here the diagonal of A (``jacobi``), with an iteration in one thread. One that takes a
+fraction of the iterations is in ``incomplete_cholesky.py``, with its iteration in ``conjugate_gradient.py``; lines on
+many levels are in ``multilevel.py``, with theirs in ``multilevel_conjugate_gradient.py``.
 """
 
 import functools
