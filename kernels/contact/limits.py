@@ -6,7 +6,8 @@ reaches the limit is still safe, and a few such places end at the limit or where
 far as it is away.
 
 A stage begins where straight lines from the state before it end that go to the stage's base, carried on at the velocity
-that the iteration starts from, as far as each node may go.
+that the iteration starts from, as far as each node may go. What an obstacle sweeps in the meantime is seen from the
+obstacle, where it is the node that goes along a straight line; so is the way of what is held.
 """
 
 import functools
@@ -66,6 +67,18 @@ def define(variant: Variant) -> SimpleNamespace:
             gone += room / approach
         return wp.min(gone, scalar(1.0))
 
+    @wp.func
+    def taken(
+        obstacles: Obstacles,
+        k: int,
+        obstacle_position_before: wp.array(dtype=vec3),
+        obstacle_rotation_before: wp.array(dtype=quat),
+        x: vec3,
+    ) -> vec3:
+        """Find where a place is that goes with an obstacle, from where it was before."""
+        local = wp.quat_rotate_inv(obstacle_rotation_before[k], x - obstacle_position_before[k])
+        return obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
+
     @wp.kernel(module=module, enable_backward=False)
     def find_faces(
         obstacles: Obstacles,
@@ -124,33 +137,37 @@ def define(variant: Variant) -> SimpleNamespace:
         i = index(wp.tid())
         count = obstacles.obstacle_shape.shape[0]
         distance = contact_distance[0]
+        end = base_position[i] + solution[i] * stage_size[0]
         x = position[i]
-        for k in range(count):
-            now = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, x), x)[3]
-            arm = position[i] - obstacle_position_before[k]
-            local = wp.quat_rotate_inv(obstacle_rotation_before[k], arm)
-            taken = obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
-            before = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, taken), taken)[3]
-            if now < distance + scalar(0.5) * (before - distance):
-                x = taken
-        move = base_position[i] + solution[i] * stage_size[0] - x
-        part = scalar(1.0)
+        if is_free[i] == 0:
+            x = end
         inside = int(0)
         for k in range(count):
-            gap = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, x), x)[3]
-            if not (gap > distance):
-                inside = int(1)
-            limit = distance + scalar(wp.static(LEFT)) * (gap - distance)
-            part = wp.min(part, reach(obstacles, meshes, k, x, move, limit))
-        if is_free[i] == 0:
-            # what is held goes where it is sent; there it may not be inside
-            inside = int(0)
-            end = base_position[i] + solution[i] * stage_size[0]
-            for k in range(count):
-                if to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, end), end)[3] <= distance:
+            begin = taken(obstacles, k, obstacle_position_before, obstacle_rotation_before, position[i])
+            gap = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, begin), begin)[3]
+            # seen from the obstacle, that is the way that a node goes which stays, or is held and sent elsewhere
+            if is_free[i] == 0:
+                if reach(obstacles, meshes, k, begin, x - begin, distance) < scalar(1.0):
                     inside = int(1)
-        elif part < scalar(1.0) or wp.length_sq(x - position[i]) > scalar(0.0):
-            solution[i] = (x + move * part - base_position[i]) / stage_size[0]
+            elif reach(obstacles, meshes, k, begin, x - begin, distance + scalar(0.5) * (gap - distance)) < scalar(1.0):
+                x = begin
+        if is_free[i] != 0:
+            move = end - x
+            part = scalar(1.0)
+            goes = wp.length_sq(x - position[i]) > scalar(0.0)
+            for k in range(count):
+                gap = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, x), x)[3]
+                if not (gap > distance):
+                    inside = int(1)
+                elif goes:
+                    # what takes it along may not take it through another one
+                    begin = taken(obstacles, k, obstacle_position_before, obstacle_rotation_before, position[i])
+                    if reach(obstacles, meshes, k, begin, x - begin, distance) < scalar(1.0):
+                        inside = int(1)
+                limit = distance + scalar(wp.static(LEFT)) * (gap - distance)
+                part = wp.min(part, reach(obstacles, meshes, k, x, move, limit))
+            if part < scalar(1.0) or goes:
+                solution[i] = (x + move * part - base_position[i]) / stage_size[0]
         if inside != 0:
             fail(status, wp.static(OVERLAPPING), i)
 

@@ -181,7 +181,11 @@ class Contact:
     def keep_clear(self) -> None:
         """Let a stage's iteration start where nothing penetrates."""
         if self.obstacles:
-            self.model.launch("start_outside", "nodes")
+            a = self.model.arrays
+            # those that stand still were there before, wherever inputs have put them
+            end = "_before" if self.obstacles_move else ""
+            before = {f"obstacle_{part}_before": a[f"obstacle_{part}{end}"] for part in ("position", "rotation")}
+            self.model.launch("start_outside", "nodes", **before)
         if self.self_contact:
             self.model.launch("aim", "nodes")
             self._limit_to_pairs()
