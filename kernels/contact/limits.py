@@ -20,7 +20,7 @@ from ..core.status import IMPACT, OVERLAPPING, fail
 from ..core.structs import structs
 from ..core.variant import Variant
 from ..linear.pair_blocks import IMPACTS, TOUCHES
-from . import obstacles
+from . import barrier, obstacles
 from .distances import MESH
 
 LEFT = 0.1
@@ -32,8 +32,9 @@ PLACES = 24
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
-    to_obstacle = obstacles.functions(variant).to_obstacle
-    Obstacles = structs(variant).Obstacles
+    to_obstacle, obstacle_speed = obstacles.functions(variant).to_obstacle, obstacles.functions(variant).obstacle_speed
+    note_motion = barrier.functions(variant).note_motion
+    Obstacles, Pairs = structs(variant).Obstacles, structs(variant).Pairs
     module = variant.module("contact_limits")
 
     @wp.func
@@ -178,6 +179,56 @@ def define(variant: Variant) -> SimpleNamespace:
             rebuild_matrix[0] = 1
 
     @wp.kernel(module=module, enable_backward=False)
+    def note_obstacle_impacts(
+        obstacles: Obstacles,
+        contact_distance: wp.array(dtype=scalar),
+        contact_range: wp.array(dtype=scalar),
+        step_size: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        increment: wp.array(dtype=vec3),
+        touching: wp.array(dtype=int),
+    ):
+        """Notes impacts where a stage's last iterate led, which no evaluation of forces has seen, and where a step at
+        its acceleration would lead: what rested may be thrown off."""
+        e = index(wp.tid())
+        count = obstacles.obstacle_shape.shape[0]
+        i = index(e / count)
+        k = index(e % count)
+        at = to_obstacle(obstacles, k, obstacles.mesh_face[e], position[i])
+        n = vec3(at[0], at[1], at[2])
+        v = velocity[i] - obstacle_speed(obstacles, k, position[i])
+        later = v - increment[i] * (step_size[0] / stage_size[0] - scalar(1.0))
+        moved = vec3(at[3], wp.dot(n, v) * step_size[0], wp.dot(n, later) * step_size[0])
+        note_motion(contact_distance[0] + contact_range[0], contact_range[0], moved, touching)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def note_pair_impacts(
+        pairs: Pairs,
+        self_contact_distance: wp.array(dtype=scalar),
+        self_contact_range: wp.array(dtype=scalar),
+        step_size: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        increment: wp.array(dtype=vec3),
+        touching: wp.array(dtype=int),
+    ):
+        """Notes the same of pairs."""
+        p = index(wp.tid())
+        touch = self_contact_distance[0] + self_contact_range[0]
+        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+            q = index(pairs.near[k])
+            r = position[p] - position[q]
+            gap = wp.length(r)
+            n = r / gap
+            v = velocity[p] - velocity[q]
+            later = v - (increment[p] - increment[q]) * (step_size[0] / stage_size[0] - scalar(1.0))
+            moved = vec3(gap, wp.dot(n, v) * step_size[0], wp.dot(n, later) * step_size[0])
+            note_motion(touch, self_contact_range[0], moved, touching)
+
+    @wp.kernel(module=module, enable_backward=False)
     def refuse_impact(touching: wp.array(dtype=int), status: wp.array(dtype=int)):
         """Leaves a step with an impact to a method that does not extrapolate."""
         if touching[wp.static(IMPACTS)] != 0:
@@ -189,6 +240,8 @@ def define(variant: Variant) -> SimpleNamespace:
         target[k] = source[k]
 
     return SimpleNamespace(
+        note_obstacle_impacts=note_obstacle_impacts,
+        note_pair_impacts=note_pair_impacts,
         refuse_impact=refuse_impact,
         ask_where_touching=ask_where_touching,
         copy_rotations=copy_rotations,

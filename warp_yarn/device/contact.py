@@ -212,7 +212,14 @@ class Contact:
     def refuse_impact(self) -> None:
         """Leave a step with an impact to a method that damps."""
         if self.on and self.model.energy.on:
+            wp.capture_if(self.model.arrays["touching"], on_true=self._note_impacts)
             self.model.launch("refuse_impact", 1)
+
+    def _note_impacts(self) -> None:
+        if self.obstacles:
+            self.model.launch("note_obstacle_impacts", "node_obstacles")
+        if self.self_contact:
+            self.model.launch("note_pair_impacts", "nodes")
 
     def load(self, stage: int) -> None:
         """Put obstacles where they are at the time of a stage, and note where they were at that of the state before."""
