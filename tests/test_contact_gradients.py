@@ -67,7 +67,7 @@ def check_derivatives(rollout: wt.Rollout, names: tuple[str, ...]) -> None:
             return (ends[0] - ends[1]) / (2.0 * h)
 
         errors = []
-        for h in (3e-4, 3e-5, 3e-6):
+        for h in (1e-3, 3e-4, 3e-5, 3e-6):
             expected = (4.0 * difference(h) - difference(2.0 * h)) / 3.0
             errors.append(abs(found - expected) / abs(expected))
             if errors[-1] < 1e-5:

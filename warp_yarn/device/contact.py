@@ -133,7 +133,10 @@ class Contact:
     Attributes:
         on: whether the scene has any.
         obstacles_move: whether any obstacle has a path.
+        damps_impacts: whether a method that has a fallback leaves steps with an impact to it.
     """
+
+    damps_impacts = True
 
     def __init__(self, model: Model):
         self.model, scene = model, model.scene
@@ -211,7 +214,7 @@ class Contact:
 
     def refuse_impact(self) -> None:
         """Leave a step with an impact to a method that damps."""
-        if self.on and self.model.energy.on:
+        if self.on and self.damps_impacts:
             wp.capture_if(self.model.arrays["touching"], on_true=self._note_impacts)
             self.model.launch("refuse_impact", 1)
 

@@ -264,6 +264,7 @@ def _made(
     check_contact(scene, integrator)
     model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, **options)
     model.energy.on = model.energy.on and bool(energy_watch)
+    model.contact.damps_impacts = bool(energy_watch)
     refuse_recording(model.device)
     at_once = method(model)
     if step_error is not None:
