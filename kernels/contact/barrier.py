@@ -31,9 +31,10 @@ CYCLING = 12
 between sticking and sliding for ever. (Always, Newton's iteration would creep.)"""
 
 
-FAST = 0.05
+FAST = 0.02
 """Part of its range by which a contact's gap may change in a step of two stages: the second one's base is extrapolated
-from the first, and gains up to half of an impact's energy beyond."""
+from the first, and gains up to half of an impact's energy beyond. At 0.05, what rebounds at 0.05 m/s gains 0.4 % of its
+energy in a step of 1 ms, at 0.02 nothing that can be seen."""
 STIFFNESS, DISTANCE, RANGE, SLIP_SPEED, DAMPING_SPEED = 0, 1, 2, 3, 4
 """Places of a law's numbers, which kernels pass on as a vector."""
 
@@ -130,6 +131,20 @@ def functions(variant: Variant) -> SimpleNamespace:
         if step_size * wp.max(wp.abs(rate), wp.abs(rate + wp.dot(n, change))) > scalar(FAST) * law[RANGE]:
             touching[wp.static(IMPACTS)] = 1
 
+    @wp.func
+    def note_motion(touch: scalar, reach: scalar, moved: vec3, touching: wp.array(dtype=int)):
+        """Note an impact of what touches, or did a step ago: by its gap, how far that moves in a step, and in one that
+        begins later."""
+        most = wp.max(wp.abs(moved[1]), wp.abs(moved[2]))
+        if moved[0] - wp.max(moved[1], scalar(0.0)) < touch and most > scalar(FAST) * reach:
+            touching[wp.static(IMPACTS)] = 1
+
     return SimpleNamespace(
-        law_of=law_of, note=note_contact, barrier=barrier, load=contact_load, force=contact_force, matrix=contact_matrix
+        note_motion=note_motion,
+        law_of=law_of,
+        note=note_contact,
+        barrier=barrier,
+        load=contact_load,
+        force=contact_force,
+        matrix=contact_matrix,
     )

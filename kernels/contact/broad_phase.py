@@ -5,7 +5,8 @@ the cloth, the arc of a fold of two layers. Those nearer are kept apart by the y
 
 A list has what is within D + d̂ and a margin, and holds until nodes have moved by the margin relative to each other:
 each by half of it relative to one of them, so that a cloth which flies needs no new one. Its order is that of the
-grid's cells, and so the same in every run.
+nodes, and steps of the iteration are shortened to what a new list would hold for: results do not depend on where the
+list was made.
 """
 
 import functools
@@ -79,7 +80,12 @@ def define(variant: Variant) -> SimpleNamespace:
             dv = rest_place[2 * j + 1] - v
             if du * du + dv * dv >= apart and wp.length_sq(position[j] - x) < reach * reach:
                 if count < pairs.near_room:
-                    pairs.near[index(i * pairs.near_room + count)] = j
+                    # in the order of nodes: sums round alike, whatever the grid
+                    place = index(i * pairs.near_room + count)
+                    while place > i * pairs.near_room and pairs.near[place - 1] > j:
+                        pairs.near[place] = pairs.near[place - 1]
+                        place -= 1
+                    pairs.near[place] = j
                 count += 1
         if count > pairs.near_room:
             fail(status, wp.static(CROWDED), i)
@@ -91,18 +97,13 @@ def define(variant: Variant) -> SimpleNamespace:
         near_margin: wp.array(dtype=scalar),
         stage_size: wp.array(dtype=scalar),
         direction: wp.array(dtype=vec3),
-        position: wp.array(dtype=vec3),
-        near_position: wp.array(dtype=vec3),
         step_length: wp.array(dtype=scalar),
     ):
-        """Shortens a step so far that the list still holds where it leads to."""
+        """Shortens a step to half of the margin: the list holds for a whole one, or is new (``measure_stray``)."""
         i = index(wp.tid())
-        middle = index(nodes / 2)
-        stray = position[i] - near_position[i] - (position[middle] - near_position[middle])
-        move = (direction[i] - direction[middle]) * stage_size[0]
-        allowed = scalar(0.5) * near_margin[0] - wp.length(stray)
-        size = wp.length(move)
+        size = wp.length(direction[i] - direction[index(nodes / 2)]) * stage_size[0]
+        allowed = scalar(0.5) * near_margin[0]
         if size > allowed:
-            wp.atomic_min(step_length, 0, wp.max(allowed, scalar(0.0)) / size)
+            wp.atomic_min(step_length, 0, allowed / size)
 
     return SimpleNamespace(measure_stray=measure_stray, list_near=list_near, limit_to_list=limit_to_list)

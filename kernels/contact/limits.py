@@ -6,7 +6,8 @@ reaches the limit is still safe, and a few such places end at the limit or where
 far as it is away.
 
 A stage begins where straight lines from the state before it end that go to the stage's base, carried on at the velocity
-that the iteration starts from, as far as each node may go.
+that the iteration starts from, as far as each node may go. What an obstacle sweeps in the meantime is seen from the
+obstacle, where it is the node that goes along a straight line; so is the way of what is held.
 """
 
 import functools
@@ -19,8 +20,8 @@ from ..core.status import IMPACT, OVERLAPPING, fail
 from ..core.structs import structs
 from ..core.variant import Variant
 from ..linear.pair_blocks import IMPACTS, TOUCHES
+from . import barrier, obstacles
 from . import meshes as mesh_contact
-from . import obstacles
 from .distances import MESH
 
 LEFT = 0.1
@@ -32,8 +33,9 @@ PLACES = 24
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
-    to_obstacle = obstacles.functions(variant).to_obstacle
-    Obstacles, Faces = structs(variant).Obstacles, structs(variant).Faces
+    to_obstacle, obstacle_speed = obstacles.functions(variant).to_obstacle, obstacles.functions(variant).obstacle_speed
+    note_motion = barrier.functions(variant).note_motion
+    Obstacles, Faces, Pairs = structs(variant).Obstacles, structs(variant).Faces, structs(variant).Pairs
     vec4, to_face = variant.vec4, mesh_contact.functions(variant).to_face
     module = variant.module("contact_limits")
 
@@ -74,6 +76,18 @@ def define(variant: Variant) -> SimpleNamespace:
                 break
             gone += room / approach
         return wp.min(gone, scalar(1.0))
+
+    @wp.func
+    def taken(
+        obstacles: Obstacles,
+        k: int,
+        obstacle_position_before: wp.array(dtype=vec3),
+        obstacle_rotation_before: wp.array(dtype=quat),
+        x: vec3,
+    ) -> vec3:
+        """Find where a place is that goes with an obstacle, from where it was before."""
+        local = wp.quat_rotate_inv(obstacle_rotation_before[k], x - obstacle_position_before[k])
+        return obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
 
     @wp.kernel(module=module, enable_backward=False)
     def limit_to_obstacles(
@@ -123,33 +137,39 @@ def define(variant: Variant) -> SimpleNamespace:
         i = index(wp.tid())
         count = obstacles.obstacle_shape.shape[0]
         distance = contact_distance[0]
+        end = base_position[i] + solution[i] * stage_size[0]
         x = position[i]
-        for k in range(count):
-            now = nearest(obstacles, faces, meshes, k, x)[3]
-            arm = position[i] - obstacle_position_before[k]
-            local = wp.quat_rotate_inv(obstacle_rotation_before[k], arm)
-            taken = obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
-            before = nearest(obstacles, faces, meshes, k, taken)[3]
-            if now < distance + scalar(0.5) * (before - distance):
-                x = taken
-        move = base_position[i] + solution[i] * stage_size[0] - x
-        part = scalar(1.0)
+        if is_free[i] == 0:
+            x = end
         inside = int(0)
         for k in range(count):
-            gap = nearest(obstacles, faces, meshes, k, x)[3]
-            if not (gap > distance):
-                inside = int(1)
-            limit = distance + scalar(wp.static(LEFT)) * (gap - distance)
-            part = wp.min(part, reach(obstacles, faces, meshes, k, x, move, limit))
-        if is_free[i] == 0:
-            # what is held goes where it is sent; there it may not be inside
-            inside = int(0)
-            end = base_position[i] + solution[i] * stage_size[0]
-            for k in range(count):
-                if nearest(obstacles, faces, meshes, k, end)[3] <= distance:
+            begin = taken(obstacles, k, obstacle_position_before, obstacle_rotation_before, position[i])
+            gap = nearest(obstacles, faces, meshes, k, begin)[3]
+            # seen from the obstacle, that is the way that a node goes which stays, or is held and sent elsewhere
+            if is_free[i] == 0:
+                if reach(obstacles, faces, meshes, k, begin, x - begin, distance) < scalar(1.0):
                     inside = int(1)
-        elif part < scalar(1.0) or wp.length_sq(x - position[i]) > scalar(0.0):
-            solution[i] = (x + move * part - base_position[i]) / stage_size[0]
+            elif reach(
+                obstacles, faces, meshes, k, begin, x - begin, distance + scalar(0.5) * (gap - distance)
+            ) < scalar(1.0):
+                x = begin
+        if is_free[i] != 0:
+            move = end - x
+            part = scalar(1.0)
+            goes = wp.length_sq(x - position[i]) > scalar(0.0)
+            for k in range(count):
+                gap = nearest(obstacles, faces, meshes, k, x)[3]
+                if not (gap > distance):
+                    inside = int(1)
+                elif goes:
+                    # what takes it along may not take it through another one
+                    begin = taken(obstacles, k, obstacle_position_before, obstacle_rotation_before, position[i])
+                    if reach(obstacles, faces, meshes, k, begin, x - begin, distance) < scalar(1.0):
+                        inside = int(1)
+                limit = distance + scalar(wp.static(LEFT)) * (gap - distance)
+                part = wp.min(part, reach(obstacles, faces, meshes, k, x, move, limit))
+            if part < scalar(1.0) or goes:
+                solution[i] = (x + move * part - base_position[i]) / stage_size[0]
         if inside != 0:
             fail(status, wp.static(OVERLAPPING), i)
 
@@ -158,6 +178,58 @@ def define(variant: Variant) -> SimpleNamespace:
         """Asks for a new matrix where anything touches: the barrier's changes from iterate to iterate."""
         if touching[wp.static(TOUCHES)] != 0:
             rebuild_matrix[0] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def note_obstacle_impacts(
+        obstacles: Obstacles,
+        faces: Faces,
+        meshes: wp.array(dtype=wp.uint64),
+        contact_distance: wp.array(dtype=scalar),
+        contact_range: wp.array(dtype=scalar),
+        step_size: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        increment: wp.array(dtype=vec3),
+        touching: wp.array(dtype=int),
+    ):
+        """Notes impacts where a stage's last iterate led, which no evaluation of forces has seen, and where a step at
+        its acceleration would lead: what rested may be thrown off."""
+        e = index(wp.tid())
+        count = obstacles.obstacle_shape.shape[0]
+        i = index(e / count)
+        k = index(e % count)
+        at = nearest(obstacles, faces, meshes, k, position[i])
+        n = vec3(at[0], at[1], at[2])
+        v = velocity[i] - obstacle_speed(obstacles, k, position[i])
+        later = v - increment[i] * (step_size[0] / stage_size[0] - scalar(1.0))
+        moved = vec3(at[3], wp.dot(n, v) * step_size[0], wp.dot(n, later) * step_size[0])
+        note_motion(contact_distance[0] + contact_range[0], contact_range[0], moved, touching)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def note_pair_impacts(
+        pairs: Pairs,
+        self_contact_distance: wp.array(dtype=scalar),
+        self_contact_range: wp.array(dtype=scalar),
+        step_size: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec3),
+        increment: wp.array(dtype=vec3),
+        touching: wp.array(dtype=int),
+    ):
+        """Notes the same of pairs."""
+        p = index(wp.tid())
+        touch = self_contact_distance[0] + self_contact_range[0]
+        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+            q = index(pairs.near[k])
+            r = position[p] - position[q]
+            gap = wp.length(r)
+            n = r / gap
+            v = velocity[p] - velocity[q]
+            later = v - (increment[p] - increment[q]) * (step_size[0] / stage_size[0] - scalar(1.0))
+            moved = vec3(gap, wp.dot(n, v) * step_size[0], wp.dot(n, later) * step_size[0])
+            note_motion(touch, self_contact_range[0], moved, touching)
 
     @wp.kernel(module=module, enable_backward=False)
     def refuse_impact(touching: wp.array(dtype=int), status: wp.array(dtype=int)):
@@ -171,6 +243,8 @@ def define(variant: Variant) -> SimpleNamespace:
         target[k] = source[k]
 
     return SimpleNamespace(
+        note_obstacle_impacts=note_obstacle_impacts,
+        note_pair_impacts=note_pair_impacts,
         refuse_impact=refuse_impact,
         ask_where_touching=ask_where_touching,
         copy_rotations=copy_rotations,

@@ -204,22 +204,52 @@ def define_limits(variant: Variant) -> SimpleNamespace:
                 v = velocity[p] - velocity[pairs.near[k]]
                 contact_forces[k] = contact_force(law, contact_friction[0], gap, n, v)
 
+    @wp.func
+    def nearest_on_way(r: vec3, move: vec3) -> scalar:
+        """Find the least length of r on its way along a move."""
+        size = wp.dot(move, move)
+        part = scalar(0.0)
+        if size > scalar(0.0):
+            part = wp.clamp(-wp.dot(r, move) / size, scalar(0.0), scalar(1.0))
+        return wp.length(r + move * part)
+
     @wp.kernel(module=module, enable_backward=False)
     def check_apart(
+        nodes: int,
         pairs: Pairs,
         self_contact_distance: wp.array(dtype=scalar),
+        self_contact_range: wp.array(dtype=scalar),
+        rest_place: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
         stage_size: wp.array(dtype=scalar),
+        step_length: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
         base_position: wp.array(dtype=vec3),
         solution: wp.array(dtype=vec3),
         status: wp.array(dtype=int),
     ):
-        """Check whether a stage starts with all apart: not where what is held is pressed together."""
+        """Check whether a stage starts with all apart, and whether what is held came there through nothing: it went all
+        of its way, which the list need not cover where others did not."""
         p = index(wp.tid())
+        distance = self_contact_distance[0]
         x = base_position[p] + solution[p] * stage_size[0]
-        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
-            q = index(pairs.near[k])
-            if wp.length(x - base_position[q] - solution[q] * stage_size[0]) <= self_contact_distance[0]:
-                fail(status, wp.static(OVERLAPPING), p)
+        of_p = x - position[p]
+        if is_free[p] == 0 and step_length[0] < scalar(1.0) and wp.length_sq(of_p) > scalar(0.0):
+            touch = distance + self_contact_range[0]
+            apart = scalar(wp.static(0.25 * wp.PI * wp.PI)) * touch * touch
+            for q in range(nodes):
+                du = rest_place[2 * q] - rest_place[2 * p]
+                dv = rest_place[2 * q + 1] - rest_place[2 * p + 1]
+                if du * du + dv * dv >= apart:
+                    of_q = base_position[q] + solution[q] * stage_size[0] - position[q]
+                    if not (nearest_on_way(position[p] - position[q], of_p - of_q) > distance):
+                        fail(status, wp.static(OVERLAPPING), p)
+        else:
+            for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
+                q = index(pairs.near[k])
+                of_q = base_position[q] + solution[q] * stage_size[0] - position[q]
+                if not (nearest_on_way(position[p] - position[q], of_p - of_q) > distance):
+                    fail(status, wp.static(OVERLAPPING), p)
 
     return SimpleNamespace(
         check_apart=check_apart,

@@ -162,7 +162,7 @@ class Box(Obstacle):
     ):
         half = finite_array("half_extents", half_extents, (3,))
         for k, value in enumerate(half):
-            real(f"half_extents[{k}]", value, above=0.0)
+            real(f"half_extents[{k}]", float(value), above=0.0)
         center, rotation = finite_array("center", center, (3,)), unit_quaternion("rotation", rotation)
         self._place(half, center, rotation, friction, path)
         self._fix(center=center, half_extents=half, rotation=rotation, friction=self.friction, path=self.path)

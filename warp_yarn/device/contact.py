@@ -140,7 +140,10 @@ class Contact:
         on: whether the scene has any.
         obstacles_move: whether any obstacle has a path.
         has_mesh: whether any is a mesh.
+        damps_impacts: whether a method that has a fallback leaves steps with an impact to it.
     """
+
+    damps_impacts = True
 
     def __init__(self, model: Model):
         self.model, scene = model, model.scene
@@ -196,7 +199,11 @@ class Contact:
     def keep_clear(self) -> None:
         """Let a stage's iteration start where nothing penetrates."""
         if self.obstacles:
-            self.model.launch("start_outside", "nodes")
+            a = self.model.arrays
+            # those that stand still were there before, wherever inputs have put them
+            end = "_before" if self.obstacles_move else ""
+            before = {f"obstacle_{part}_before": a[f"obstacle_{part}{end}"] for part in ("position", "rotation")}
+            self.model.launch("start_outside", "nodes", **before)
         if self.self_contact:
             self.model.launch("aim", "nodes")
             self._limit_to_pairs()
@@ -222,8 +229,15 @@ class Contact:
 
     def refuse_impact(self) -> None:
         """Leave a step with an impact to a method that damps."""
-        if self.on and self.model.energy.on:
+        if self.on and self.damps_impacts:
+            wp.capture_if(self.model.arrays["touching"], on_true=self._note_impacts)
             self.model.launch("refuse_impact", 1)
+
+    def _note_impacts(self) -> None:
+        if self.obstacles:
+            self.model.launch("note_obstacle_impacts", "node_obstacles")
+        if self.self_contact:
+            self.model.launch("note_pair_impacts", "nodes")
 
     def load(self, stage: int) -> None:
         """Put obstacles where they are at the time of a stage, and note where they were at that of the state before."""

@@ -29,7 +29,13 @@ class Failure:
         arrays.put("status", 0, 0, 0)
 
     def error(
-        self, step: int, trajectory: Trajectory, forces: Forces, substepping: Substepping, step_error: float | None
+        self,
+        step: int,
+        trajectory: Trajectory,
+        forces: Forces,
+        substepping: Substepping,
+        step_error: float | None,
+        near: str = "",
     ) -> SimulationError:
         """Makes the error of a step.
 
@@ -39,6 +45,7 @@ class Failure:
             forces: on the last of them, by term.
             substepping: has tried to make the step in parts.
             step_error: that was allowed, in spacings of the yarns.
+            near: what was nearest to the node before the step, in words.
         """
         model, node, term = self.model, self.node, blamed(forces, self.node)
         where = f"step {step} (t = {step * model.step_size:g} s):"
@@ -57,7 +64,8 @@ class Failure:
                 f"above its tolerance of {model.newton_tolerance_at(smallest):.1e}"
             ),
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
-            status.OVERLAPPING: "it is pressed into something that leaves it no way out",
+            status.OVERLAPPING: "it is pressed into something that leaves it no way out"
+            + (f" (before the step, {near})" if near else ""),
             status.CROWDED: "more of it comes together than there is room for",
             status.IMPACT: "something strikes it",
             status.INACCURATE: f"its error stays above step_error = {step_error}: allow more",

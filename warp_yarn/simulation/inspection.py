@@ -105,7 +105,7 @@ class Inspection:
         Raises:
             InputError: the two places that are nearest, and how near.
         """
-        contact, place = self.model.contact, self.model.scene.cloth.place
+        contact = self.model.contact
         if not contact.on:
             return
         with _Visit(self.stepper, state):
@@ -117,20 +117,42 @@ class Inspection:
             if where_known and contact.has_mesh:
                 found.append(self._with_room(contact.near_faces))
         for near in found:
-            if not len(near.gap):
-                continue
-            k = int(near.gap.argmin())
-            node, other, obstacle = int(near.node[k]), int(near.other[k]), int(near.obstacle[k])
-            of_pair = other >= 0
-            name = "self_contact_distance" if of_pair else "contact_distance"
-            least = float(self.model.arrays[name].numpy()[0])
-            if not near.gap[k] > least:
-                kind = "" if of_pair else type(self.model.scene.obstacles[obstacle]).__name__
-                it = f"node {other} ({place(other)})" if of_pair else f"obstacles[{obstacle}], a {kind}"
-                raise InputError(
-                    f"node {node} ({place(node)}) is {near.gap[k]:.3g} m from {it}: must be above the contact's "
-                    f"{'self_distance' if of_pair else 'distance'}, {least:.3g} m"
-                )
+            if len(near.gap):
+                gap, least, words = self._nearest(near)
+                if not gap > least:
+                    raise InputError(words)
+
+    @alone
+    def told_nearest(self, node: int) -> str:
+        """Tells what is nearest to a node of the present state, of what it may touch, or ""."""
+        contact = self.model.contact
+        with _Visit(self.stepper, None, ahead=True):
+            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
+            found += [contact.near_obstacles()] if contact.obstacles else []
+            found += [self._with_room(contact.near_faces)] if contact.has_mesh else []
+        told = []
+        for near in found:
+            mine = (near.node == node) | (near.other == node)
+            if mine.any():
+                gap, least, words = self._nearest(Near(*(values[mine] for values in near)))
+                told.append((gap - least, words))
+        return min(told)[1] if told else ""
+
+    def _nearest(self, near: Near) -> tuple[float, float, str]:
+        """Finds the two that are nearest: how near, how near they may be, and that in words."""
+        place = self.model.scene.cloth.place
+        k = int(near.gap.argmin())
+        node, other, obstacle = int(near.node[k]), int(near.other[k]), int(near.obstacle[k])
+        of_pair = other >= 0
+        name = "self_contact_distance" if of_pair else "contact_distance"
+        least = float(self.model.arrays[name].numpy()[0])
+        kind = "" if of_pair else type(self.model.scene.obstacles[obstacle]).__name__
+        it = f"node {other} ({place(other)})" if of_pair else f"obstacles[{obstacle}], a {kind}"
+        words = (
+            f"node {node} ({place(node)}) is {near.gap[k]:.3g} m from {it}: must be above the contact's "
+            f"{'self_distance' if of_pair else 'distance'}, {least:.3g} m"
+        )
+        return float(near.gap[k]), least, words
 
     @alone
     def energy(self, state: State | None = None) -> dict[str, float]:

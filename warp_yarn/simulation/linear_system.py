@@ -62,6 +62,12 @@ def read_system(model: Model) -> LinearSystem:
         add(x[node], its, values["upper_xs"].reshape(nodes, 4, 3)[node, slot][:, :, None])
         add(mine, x[other], values["upper_sx"].reshape(nodes, 4, 3)[node, slot][:, None, :])
         add(mine, its, values["upper_ss"].reshape(nodes, 4)[node, slot][:, None, None])
+    if model.contact.self_contact:
+        node, slot = np.nonzero(np.arange(a["near_room"]) < a["near_count"].numpy()[:, None])
+        place = node * a["near_room"] + slot
+        # both lists of a pair have its block
+        block = a["near_block"].numpy()[place][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        add(x[node], x[a["near"].numpy()[place]], -block, mirror=False)
     topology = model.scene.cloth.topology
     free = [np.repeat(a["is_free"].numpy() != 0, 3)]
     rhs = [values["rhs"].ravel()]

@@ -16,6 +16,7 @@ from ..device.model import Model
 from ..errors import choice, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
+from ..kernels.core.status import OVERLAPPING
 from ..moved import renamed_attribute
 from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
@@ -206,7 +207,8 @@ class Simulator(Inspection):
         failure = Failure(self.model)
         with np.errstate(all="ignore"):
             forces = self.forces()
-        raise failure.error(k, trajectory, forces, self.substepping, self.step_error)
+        near = self.told_nearest(failure.node) if failure.code == OVERLAPPING else ""
+        raise failure.error(k, trajectory, forces, self.substepping, self.step_error, near)
 
     def run(self, steps: int, *, progress: bool | None = False) -> Trajectory:
         """Makes steps and returns every frame, the present one first.
@@ -260,6 +262,7 @@ def _made(
     check_contact(scene, integrator)
     model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, **options)
     model.energy.on = model.energy.on and bool(energy_watch)
+    model.contact.damps_impacts = bool(energy_watch)
     refuse_recording(model.device)
     at_once = method(model)
     if step_error is not None:
