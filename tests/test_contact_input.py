@@ -5,9 +5,12 @@ import pickle
 
 import numpy as np
 import pytest
+from internals import halved
+from scipy.spatial.transform import Rotation
 from touching import GROUND, folded, lifted, paper, shapes
 
 import warp_yarn as wy
+from warp_yarn.description.cloth import CLOTH_NUMBERS
 
 NAN = float("nan")
 SPHERE = {"center": (0.0, 0.0, 0.0), "radius": 1e-3}
@@ -111,20 +114,48 @@ def test_a_copied_simulator_goes_on_alike() -> None:
     assert len(other.contacts()) == len(simulator.contacts()) > 0
 
 
+def test_what_is_not_modelled_holds_nothing_up() -> None:
+    """Without its term, an obstacle is not there, nor is the cloth for itself."""
+    cloth = folded(jitter=0.0)
+    free = wy.Scene(cloth)
+    scene = wy.Scene(cloth, obstacles=[GROUND], self_contact=True, terms=free.terms)
+    simulator = wy.Simulator(scene, integrator="implicit-euler")
+    alone = wy.Simulator(free, integrator="implicit-euler").run(40)
+    assert np.array_equal(simulator.run(40).position, alone.position)
+    assert alone.position[-1, :, 2].min() < 0.0 and len(simulator.contacts()) == 0
+
+
+def test_half_the_step_moves_obstacles_alike() -> None:
+    """Ablation's run at half the step has them where they were, at every other step's end and at constant velocity."""
+    t = 1e-3 * np.arange(1, 9)[:, None]
+    turns = Rotation.from_rotvec(t * np.array([300.0, 20.0, 0.0])).as_quat() * (-1.0) ** np.arange(8)[:, None]
+    box = wy.Box(center=(0.0, 0.0, 0.0), half_extents=(1e-3, 1e-3, 1e-3), path=np.hstack([t * (0.1, 0.0, 0.2), turns]))
+    far = paper(4, 4)
+    scene = wy.Scene(far.replace(pose=far.position + 1.0), obstacles=[box], gravity=None)
+    (half,) = halved(scene, None).obstacles
+    assert np.array_equal(half.path[1::2], box.path)
+    fine = 0.5e-3 * np.arange(1, 17)[:, None]
+    expected = Rotation.from_rotvec(fine * np.array([300.0, 20.0, 0.0]))
+    assert (expected.inv() * Rotation.from_quat(half.path[:, 3:])).magnitude().max() < 1e-12
+    assert np.abs(half.path[:, :3] - fine * (0.1, 0.0, 0.2)).max() < 1e-15
+
+
 # -- several cloths ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["implicit-euler", "sdirk2"])
 def test_cloths_apart_are_each_alone(method: str) -> None:
-    """To the tolerance of one solve for all, beside a solve for each, which yarns that begin to slide make more of."""
+    """To the tolerance of one solve for all, beside a solve for each."""
     one, two = paper(5, 5), lifted(paper(4, 6, weave="twill"), 4e-2)
     exact = {"newton_tolerance": 1e-9, "tolerance": 1e-12, "integrator": method}
     both = wy.Simulator(wy.Scene([one, two], pins=[0, 4, 25, 30], self_contact=True), **exact).run(15)
     cloths = wy.Cloths([one, two])
-    for k, (cloth, pins) in enumerate(((one, [0, 4]), (two, [0, 5]))):
+    # what each has by default, of its own mass, they share
+    shared = {name: getattr(cloths, name) for name in CLOTH_NUMBERS}
+    for k, (cloth, pins) in enumerate(((one.replace(**shared), [0, 4]), (two.replace(**shared), [0, 5]))):
         alone = wy.Simulator(wy.Scene(cloth, pins=pins, self_contact=True), **exact).run(15)
-        assert np.abs(both.position[:, cloths.nodes_of(k)] - alone.position).max() < 1e-9
-        assert np.abs(both.euler_velocity[:, cloths.nodes_of(k)] - alone.euler_velocity).max() < 1e-6
+        assert np.abs(both.position[:, cloths.nodes_of(k)] - alone.position).max() < 1e-12
+        assert np.abs(both.euler_velocity[:, cloths.nodes_of(k)] - alone.euler_velocity).max() < 1e-9
 
 
 def test_several_cloths_have_one_thread() -> None:

@@ -147,7 +147,8 @@ class Contact:
 
     def __init__(self, model: Model):
         self.model, scene = model, model.scene
-        self.obstacles, self.self_contact = bool(scene.obstacles), scene.self_contact
+        # what is not modelled does not hold anything up either
+        self.obstacles, self.self_contact = "obstacles" in scene.terms, "self_contact" in scene.terms
         self.on = self.obstacles or self.self_contact
         self.obstacles_move = "obstacles move" in model.arrays.conditions
         self._tapes: dict[int, wp.Tape] = {}

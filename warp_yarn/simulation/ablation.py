@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..description.obstacles import Obstacle
 from ..description.scene import Scene
 from ..errors import InputError, SimulationError, integer, real
 from ..kernels import TERMS
@@ -208,11 +209,24 @@ def _without(scene: Scene, names: set[str]) -> Scene:
 
 
 def _halved(scene: Scene, start: State | None) -> Scene:
-    """Makes the scene for half the step: pins go evenly to where they are at a step's end, and forces stay for two."""
+    """Makes the scene for half the step: pins and obstacles go evenly to where they are at a step's end, and forces
+    stay for two."""
     path = scene.pin_path
     if path is not None:
         first = (scene.cloth if start is None else start).position[scene.pins]
         before = np.concatenate([first[None], path[:-1]])
         path = np.stack([0.5 * (before + path), path], axis=1).reshape(-1, *path.shape[1:])
     forces = {node: np.repeat(f, 2, axis=0) if f.ndim == 2 else f for node, f in scene.forces.items()}
-    return scene.replace(pin_path=path, forces=forces)
+    obstacles = [o if o.path is None else o.replace(path=_halved_poses(o)) for o in scene.obstacles]
+    return scene.replace(pin_path=path, forces=forces, obstacles=obstacles)
+
+
+def _halved_poses(obstacle: Obstacle) -> np.ndarray:
+    """Adds poses in the middle of an obstacle's steps."""
+    before = np.vstack([[*obstacle.position, *obstacle.rotation], obstacle.path[:-1]])
+    after = obstacle.path.copy()
+    # the shorter way round; halfway, the mean of two rotations is the one between
+    after[:, 3:] *= np.where((before[:, 3:] * after[:, 3:]).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+    middle = 0.5 * (before + after)
+    middle[:, 3:] /= np.linalg.norm(middle[:, 3:], axis=1, keepdims=True)
+    return np.stack([middle, obstacle.path], axis=1).reshape(-1, 7)
