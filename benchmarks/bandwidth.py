@@ -169,7 +169,7 @@ class Solver:
         if model.scene.sliding:
             wp.copy(a["euler_solution"], a["euler_velocity"])
         model.max_iterations = iterations
-        with model.threads_at_hand():
+        with model.threads.at_hand():
             begin = time.perf_counter()
             model.solve(tolerance=self.tolerance)
             seconds = time.perf_counter() - begin

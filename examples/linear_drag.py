@@ -10,38 +10,37 @@ A falling cloth of one yarn stays as it is, and its velocity is g τ (1 − exp(
 
 import numpy as np
 import warp as wp
-from warp_yarn.kernels.core.indexing import coordinates, index
+from warp_yarn.kernels.core.indexing import ends, index
+from warp_yarn.kernels.core.structs import structs
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
 
 
 def define(variant: wy.Variant) -> wp.Kernel:
-    scalar, vec3, mat33 = variant.scalar, variant.vec3, variant.mat33
+    scalar, vec3, BlockMatrix = variant.scalar, variant.vec3, structs(variant).BlockMatrix
 
     @variant.kernel("terms")
     def linear_drag_term(
-        segment_nodes: wp.array(dtype=wp.vec2i),
-        segment_yarn: wp.array(dtype=int),
-        yarn_direction: wp.array(dtype=int),
+        segments: wp.array(dtype=wp.vec4i),
         linear_drag: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
         velocity: wp.array(dtype=vec3),
         force: wp.array(dtype=vec3),
         momentum: wp.array(dtype=vec3),
         matrix: int,
-        coefficients: wp.array(dtype=vec3),
-        diagonal_xx: wp.array(dtype=mat33),
+        blocks: BlockMatrix,
     ):
-        e = index(wp.tid())
-        sa, sb = coordinates(segment_nodes, segment_yarn, yarn_direction, e)
+        a, b, sa, sb, _yarn, _direction = ends(segments, index(wp.tid()))
         c = scalar(0.5) * linear_drag[0] * (euler[sb] - euler[sa])
-        for end in range(2):
-            i = index(segment_nodes[e][end])
-            wp.atomic_add(force, i, velocity[i] * (-c))
-            if matrix != 0:
-                wp.atomic_add(momentum, i, velocity[i] * (coefficients[0][1] * c))
-                wp.atomic_add(diagonal_xx, i, wp.identity(n=3, dtype=scalar) * (coefficients[0][1] * c))
+        wp.atomic_add(force, a, velocity[a] * (-c))
+        wp.atomic_add(force, b, velocity[b] * (-c))
+        if matrix != 0:
+            damping = blocks.coefficients[0][1] * c
+            wp.atomic_add(momentum, a, velocity[a] * damping)
+            wp.atomic_add(momentum, b, velocity[b] * damping)
+            wp.atomic_add(blocks.diagonal_xx, a, wp.identity(n=3, dtype=scalar) * damping)
+            wp.atomic_add(blocks.diagonal_xx, b, wp.identity(n=3, dtype=scalar) * damping)
 
     return linear_drag_term
 

@@ -9,7 +9,7 @@ import functools
 
 import warp as wp
 
-from .contact import broad_phase, limits, obstacles, self_contact
+from .contact import broad_phase, limits, meshes, obstacles, self_contact
 from .core.variant import Term, TermParameter, Variant
 from .linear import (
     block_matrix,
@@ -49,6 +49,7 @@ _OWN = (
     pins.TERM,
     applied_force.TERM,
     obstacles.TERM,
+    meshes.TERM,
     self_contact.TERM,
     friction.TERM,  # last: it reads the sum of the others
 )
@@ -57,7 +58,7 @@ TERMS: dict[str, Term] = {term.name: term for term in _OWN}
 
 
 def own(term: Term) -> bool:
-    """Whether a term is the package's own, and not one that was registered."""
+    """Tell whether a term is the package's own, and not one that was registered."""
     return term in _OWN
 
 
@@ -67,8 +68,8 @@ def parameters() -> dict[str, TermParameter]:
 
 
 def in_order() -> dict[str, Term]:
-    """Every term by its name, in the order of their launches: one that was registered stands before friction, and where
-    it presses before all that reads the contact."""
+    """Sort every term, by its name, as they are launched: one that was registered stands before friction, and where it
+    presses before all that reads the contact."""
     terms = list(_OWN)
     for term in tuple(TERMS.values()):
         if not own(term):
@@ -78,7 +79,7 @@ def in_order() -> dict[str, Term]:
 
 
 def build(variant: Variant, terms: tuple[str, ...] = ()) -> dict[str, wp.Kernel]:
-    """Every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
+    """Define every kernel of a variant, by name: ``stretch``, ``stretch_energy``, ...
 
     Args:
         variant: the variant.
@@ -93,7 +94,7 @@ def build(variant: Variant, terms: tuple[str, ...] = ()) -> dict[str, wp.Kernel]
 
 @functools.cache
 def build_term(term: Term, variant: Variant) -> dict[str, wp.Kernel]:
-    """The kernels of a term that is not the package's own, in modules of their own: see ``_build``."""
+    """Define the kernels of a term that is not the package's own, in modules of their own: see ``_build``."""
     variant = dataclasses.replace(variant, term=term.name)
     variant.fuse("terms")
     kernels = {term.name: term.define(variant)}
@@ -104,7 +105,7 @@ def build_term(term: Term, variant: Variant) -> dict[str, wp.Kernel]:
 
 @functools.cache
 def _build(variant: Variant) -> dict[str, wp.Kernel]:
-    """The package's own kernels.
+    """Define the package's own kernels.
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
@@ -123,7 +124,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
     kernels |= vars(limits.define_motion(variant))
-    for reports in (obstacles.define_reports, self_contact.define_limits):
+    for reports in (obstacles.define_reports, meshes.define_search, self_contact.define_limits):
         kernels |= vars(reports(variant.forward))
     for part in (
         linear,

@@ -86,6 +86,14 @@ def scene_for(group: str, steps: int, *, sliding: bool = True, stiffness: float 
     return wy.Scene(fabric, wind=WIND, pins=fabric.corners("top"), pin_stiffness=stiffness, sliding=sliding, **options)
 
 
+def colliding(speed: float) -> tuple[wy.Scene, wy.State]:
+    """Two crossings of a yarn that hardly resists sliding fly at each other, on a falling cloth."""
+    fabric = cloth(4, 4, radius=2.4e-4, friction=0.0, friction_damping=1e-3)
+    rates = np.zeros((fabric.nodes, 2))
+    rates[5, 0], rates[6, 0] = speed, -speed
+    return wy.Scene(fabric), wy.State(fabric.position, fabric.euler, np.zeros((fabric.nodes, 3)), rates)
+
+
 def gradcheck(function: Callable, inputs: list[torch.Tensor]) -> bool:
     # On numbers near 1, a difference step of 1e-6 leaves some 1e-6 of rounding and (seen by varying it) of curvature.
     return torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-5, rtol=1e-5)

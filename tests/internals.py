@@ -7,10 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from warp_yarn.kernels.core.status import GAINED, STALLED
 
 import warp_yarn as wy
+from warp_yarn.calibration.problem import CalibrationProblem
 from warp_yarn.device import exclusive
 from warp_yarn.simulation import ablation, checks
 from warp_yarn.view import render
@@ -47,6 +49,17 @@ def array_arguments(simulator: wy.Simulator, kernel: str) -> set[str]:
 def strips(simulator: wy.Simulator) -> int:
     """How many processor cores share a linear solve."""
     return simulator.model.threads.count
+
+
+def solve(simulator: wy.Simulator, force: np.ndarray) -> np.ndarray:
+    """Solves M v = h F, from v = 0, with the method's conjugate gradient; gives what is found of v."""
+    simulator.system(simulator.state, weights=(1.0, 0.0, 0.0))
+    put(simulator, "rhs", simulator.step_size * force)
+    simulator.arrays.zero("euler_rhs", "solution", "euler_solution")
+    simulator.model.factorize()
+    with simulator.model.threads.at_hand():
+        simulator.model.solve()
+    return numbers(simulator, "solution")
 
 
 # -- steps ------------------------------------------------------------------------------------------------------------
@@ -92,6 +105,24 @@ def force_a_gain(simulator: wy.Simulator) -> list[int]:
     return said
 
 
+def gain_in_a_part(simulator: wy.Simulator, size: float, left: float) -> list[float]:
+    """Says of every part of this size, with so much of its step left [steps], that it gained energy, but of the
+    fallback's; gives a list of them."""
+    substepping, gained = simulator.substepping, []
+    attempt = substepping._try
+
+    def made(method: object, count: Callable[[], None], *part: float) -> bool:
+        good = attempt(method, count, *part)
+        if method is simulator.integrator and part == (size, left):
+            put(simulator, "status", [GAINED, -1, 0])
+            gained.append(size)
+            return False
+        return good
+
+    substepping._try = made
+    return gained
+
+
 def errors_of_accepted_parts(simulator: wy.Simulator) -> list[float]:
     """A list that fills with the error [m] of every part of a step that is accepted from now on."""
     substepping, errors = simulator.substepping, []
@@ -110,6 +141,20 @@ def errors_of_accepted_parts(simulator: wy.Simulator) -> list[float]:
 def a_step_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets simulators that are made from now on keep one step on the device."""
     monkeypatch.setattr(checks, "CHUNK_BYTES", 0)
+
+
+# -- calibration ------------------------------------------------------------------------------------------------------
+
+
+def add_noise(monkeypatch: pytest.MonkeyPatch, size: float) -> None:
+    """Adds noise to the positions of every run of a calibration, another one in every run."""
+    random, run = np.random.default_rng(0), CalibrationProblem._run
+
+    def noisy(*arguments: object) -> torch.Tensor:
+        found = run(*arguments)
+        return found + size * torch.as_tensor(random.normal(size=found.shape))
+
+    monkeypatch.setattr(CalibrationProblem, "_run", noisy)
 
 
 # -- locks ------------------------------------------------------------------------------------------------------------

@@ -35,6 +35,8 @@ class Watch:
         contact = self.simulator.model.contact
         if contact.obstacles:
             self._add(contact.near_obstacles().gap, self.distances[0])
+        if contact.has_mesh:
+            self._add(contact.near_faces().gap, self.distances[0])
         if contact.self_contact:
             self._add(
                 gaps_of_pairs(self.simulator.scene.cloth, self.simulator, numbers(self.simulator, "position")),
@@ -42,7 +44,7 @@ class Watch:
             )
 
     def _add(self, gap: np.ndarray, distance: float) -> None:
-        self.least = min(self.least, float(gap.min()) / distance - 1.0)
+        self.least = min(self.least, float(gap.min(initial=np.inf)) / distance - 1.0)
 
 
 def watched(simulator: wy.Simulator, steps: int, monkeypatch: pytest.MonkeyPatch) -> Watch:
@@ -337,10 +339,9 @@ def test_velocity_of_an_obstacle_is_the_difference_of_its_pose() -> None:
 def test_nothing_of_contact_without_contact() -> None:
     """Arrays of contact are those alone that every kernel takes, and none has as many numbers as there are nodes."""
     simulator = wy.Simulator(wy.Scene(paper(5, 5)))
-    kept = {
-        name for name in simulator.arrays if any(word in name for word in ("obstacle", "near", "touch", "contact_s"))
-    }
-    assert kept <= {"touching", "near_room"}
+    words = ("obstacle", "near", "touch", "contact_s", "mesh", "face")
+    kept = {name for name, a in simulator.arrays.items() if a is not None and any(word in name for word in words)}
+    assert kept <= {"touching", "near_room", "face_room"}
 
 
 def test_a_state_that_touches_is_reported() -> None:

@@ -80,6 +80,14 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert command in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
+def test_hooks_before_a_commit_are_the_checks_of_ci():
+    """In their order, and there is nothing else that CI looks at before it tests."""
+    hooks = re.findall(r"^ +entry: ([a-z ]+?)(?: --.*)?$", (ROOT / ".pre-commit-config.yaml").read_text(), flags=re.M)
+    commands = re.findall(r"\.venv/bin/([a-z]+(?: [a-z]+)?)", (ROOT / ".ci" / "run").read_text())
+    assert hooks == [command for command in commands if command.startswith(("ruff", "mypy"))]
+    assert len(hooks) == 3
+
+
 def test_the_package_says_its_version_and_that_it_has_types():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert wy.__version__ == project["project"]["version"]

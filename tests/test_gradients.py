@@ -73,7 +73,7 @@ def hung(friction: float, friction_damping: float, steps: int = 50) -> tuple[wt.
     fabric = cloth(6, 6, "twill", friction=friction, friction_damping=friction_damping)
     scene = wy.Scene(fabric, wind=wy.Wind(velocity=(0.0, 5.0, 0.0)), pins=fabric.corners("top"))
     rollout = wt.Rollout(scene, steps, integrator="linear", tolerance=EXACT)
-    values = {name: rollout.defaults[name] for name in (*NUMBERS, *VECTORS)}
+    values = {name: rollout.defaults[name] for name in (*NUMBERS, *VECTORS) if name in rollout.inputs}
     for name in ("density", "stretch", "bend"):
         values[name] = torch.tensor([getattr(yarn, name) for yarn in YARNS], dtype=torch.float64)
     return rollout, values
@@ -399,7 +399,7 @@ def made_with(name: str, value: float) -> None:
         cloth(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["density", "stretch", "bend", *NUMBERS])
+@pytest.mark.parametrize("name", ["density", "stretch", "bend", *(name for name in NUMBERS if "contact" not in name)])
 @pytest.mark.parametrize("value", [-1e-4, -0.0, 0.0, 1e-3, float("inf")])
 def test_tensors_have_the_ranges_of_numbers(name: str, value: float) -> None:
     rollout = wt.Rollout(scene_for("plain", 1), 1, integrator="linear")

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from inputs import GROUPS, WIND, cloth, jittered, scaled, scene_for
+from inputs import GROUPS, WIND, cloth, colliding, jittered, scaled, scene_for
 from internals import fails_at_first, left_of_the_last_stage, newton_tolerance, numbers, put, strips
 
 import warp_yarn as wy
@@ -250,14 +250,6 @@ def test_unknown_method_is_refused() -> None:
         match=r"integrator = 'leapfrog', must be one of linear, implicit-euler, implicit-midpoint, sdirk2, ros2",
     ):
         wy.Simulator(scene_for("plain", 1), integrator="leapfrog")
-
-
-def colliding(speed: float) -> tuple[wy.Scene, wy.State]:
-    """Two crossings of a yarn that hardly resists sliding fly at each other, on a falling cloth."""
-    fabric = cloth(4, 4, radius=2.4e-4, friction=0.0, friction_damping=1e-3)
-    rates = np.zeros((fabric.nodes, 2))
-    rates[5, 0], rates[6, 0] = speed, -speed
-    return wy.Scene(fabric), wy.State(fabric.position, fabric.euler, np.zeros((fabric.nodes, 3)), rates)
 
 
 def test_a_step_that_fails_is_made_in_parts() -> None:

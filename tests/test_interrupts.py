@@ -121,7 +121,7 @@ def test_a_run_is_interrupted_anywhere(name):
     assert stopped > 100
 
 
-@pytest.mark.parametrize("integrator", quick(INTEGRATORS, "linear", "sdirk2"))
+@pytest.mark.parametrize("integrator", quick(INTEGRATORS, "linear"))
 def test_the_first_step_is_interrupted_anywhere(integrator):
     """While its graph is captured: no capture stays open."""
     whole = simulator(integrator=integrator).run(2)
@@ -197,8 +197,15 @@ def test_damped_steps_are_interrupted_anywhere():
     assert sim.damped_steps == set() and sim.substepping.damped == 0
 
 
+@pytest.mark.slow
 def test_a_team_is_interrupted_anywhere():
     """Its helpers end, and others take their place."""
+
+    def helpers() -> int:
+        # threads of Warp's and of locks, which Python counts for ever once it has seen them, are of another class
+        return sum(type(thread) is threading.Thread for thread in threading.enumerate())
+
+    before = helpers()
     wide = wy.paper.hung_cloth("plain", 3, 16)
     sim = wy.Simulator(wide, threads=2)
     whole = sim.run(3)
@@ -212,9 +219,9 @@ def test_a_team_is_interrupted_anywhere():
                 sim.run(3)
         except _Stop:
             check_goes_on(sim, whole)
-        assert threading.active_count() < 20
+        assert helpers() < before + 20
     sim.reset()
-    assert threading.active_count() < 6 and same(sim.run(3), whole)
+    assert helpers() <= before + 1 and same(sim.run(3), whole)
 
 
 @pytest.mark.parametrize("call", ["state", "energy", "forces", "contact", "system", "reset", "deepcopy"])
@@ -456,7 +463,7 @@ def check_equal(found: object, expected: object) -> None:
         assert np.array_equal(found, expected)
 
 
-@pytest.fixture(scope="module", params=["sdirk2", "linear", "short chunks", "step_error"])
+@pytest.fixture(scope="module", params=quick(["sdirk2", "linear", "short chunks", "step_error"], "short chunks"))
 def pair(request) -> Pair:
     return Pair(**OPTIONS[request.param])
 

@@ -63,7 +63,7 @@ def test_tasks_and_results_go_to_another_process_and_back(data):
             pool.submit(learn, problem, iterations=-1).result()
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("error", [pytest.param(KeyboardInterrupt, marks=pytest.mark.slow), OSError])
 def test_what_ends_learning_has_what_was_learned(data, tmp_path, monkeypatch, error):
     """The iterations until then, and a checkpoint to go on from."""
     uninterrupted = learn(problem_of(data))

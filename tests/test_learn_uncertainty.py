@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
+from internals import add_noise
 from learning import COULOMB, DENSITY, SCENE, SHEAR, motion, problem_of, truth
 from scripts import load
 
@@ -133,6 +133,7 @@ def test_a_step_that_cannot_be_halved_leaves_its_part_unknown(data, monkeypatch)
 # -- benchmarks/uncertainty.py: real yarns, and yarns that ring -------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fabric", "pose", "of", "seeds"),
     [("paper", "saddle", ("same", "finer"), 3), ("handkerchief", "flat", ("same",), 2)],
@@ -174,13 +175,8 @@ def test_differences_are_taken_above_what_the_solver_leaves(monkeypatch):
     values = truth(exact)
     exact = exact.jacobian(values, exact.residuals(values))
     # three times what a plain difference makes of the parameter that does the least, another one in every run
-    random, run = np.random.default_rng(0), CalibrationProblem._run
     noise = 3.0 * differences.WIDTH * np.linalg.norm(exact, axis=0).min() / np.sqrt(len(exact))
-    monkeypatch.setattr(
-        CalibrationProblem,
-        "_run",
-        lambda *a: run(*a) + noise * torch.as_tensor(random.normal(size=target.position[1:].shape)),
-    )
+    add_noise(monkeypatch, noise)
     loose = CalibrationProblem(scene, target, parameters)
     residuals = loose.residuals(values)
     plain = [differences.difference(loose, values, residuals, differences.WIDTH, -row) for row in np.eye(4)]

@@ -171,7 +171,7 @@ def check_sequence(rollout: wt.Rollout, fresh: Callable[[], wt.Rollout], seed: i
 
 
 # Sequences that are interrupted where a run, a step in parts or a failure would leave something behind.
-@pytest.mark.parametrize(("seed", "every"), [(5, 2), (11, 1)])
+@pytest.mark.parametrize(("seed", "every"), [(5, 2), pytest.param(11, 1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", quick(INTEGRATORS, "linear"))
 def test_a_rollout_answers_as_a_fresh_one(method: str, seed: int, every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def fresh() -> wt.Rollout:
@@ -213,7 +213,7 @@ def test_a_gradient_is_the_same_after_another_one(first: str, then: str, monkeyp
     assert torch.equal(gradient(first), before)
 
 
-@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("shared", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_rollouts_in_threads_answer_as_alone(shared: bool) -> None:
     """One that they share, or one for each call, made by its thread, which captures all of its graphs there."""
     rollout, random = wt.Rollout(scene(), STEPS), np.random.default_rng(3)

@@ -16,44 +16,6 @@ FILES = {
 MOST = {"kernel": 16, "class": 200, "module": 400}
 """Arguments of a kernel, or of what it calls; lines of a class and of a module."""
 
-LARGER = {
-    # to be mended, each with its file
-    "kernels/linear/block_matrix.py jacobi_conjugate_gradient",
-    "kernels/linear/conjugate_gradient.py backward_sweep",
-    "kernels/linear/conjugate_gradient.py forward_sweep",
-    "kernels/linear/conjugate_gradient.py incomplete_conjugate_gradient",
-    "kernels/linear/lines.py factorize_nodes",
-    "kernels/linear/multilevel.py",
-    "kernels/linear/multilevel.py multilevel_conjugate_gradient",
-    "kernels/nonlinear/newton.py",
-    "kernels/nonlinear/newton.py judge",
-    "kernels/stepping/ros2.py first_stage_adjoint",
-    "kernels/terms/bending.py bending_term",
-    "kernels/terms/friction.py friction_term",
-    "kernels/terms/inertia.py mass_term",
-    "kernels/terms/stretch.py stretch_term",
-    "warp_yarn/calibration/learn.py",
-    "warp_yarn/calibration/learn.py Task",
-    "warp_yarn/calibration/learn.py _Search",
-    "warp_yarn/device/arrays.py Arrays",
-    "warp_yarn/device/model.py",
-    "warp_yarn/device/model.py Model",
-    "warp_yarn/gradients/rollout.py",
-    "warp_yarn/gradients/rollout.py Rollout",
-    "warp_yarn/integrators/stage.py",
-    "warp_yarn/integrators/stage.py StageMethod",
-}
-"""What is larger, with the reason for each. None else may be, and what is no longer larger leaves the list."""
-
-NO_VERBS_YET = (
-    "kernels/",
-    "warp_yarn/calibration/",
-    "warp_yarn/device/",
-    "warp_yarn/gradients/",
-    "warp_yarn/integrators/",
-)
-"""Where docstrings are still to be mended: beginnings of paths, each of which has one."""
-
 VERBS = set(
     re.findall(
         r"\w+",
@@ -132,11 +94,13 @@ def test_sizes_are_counted():
     assert larger("warp_yarn/x.py", f"class A:\n{body[10:]}" + "a = 1\n" * 200) == {}
 
 
-def test_nothing_is_larger_but_what_is_listed():
+def test_nothing_is_larger():
+    """What has a good reason to be is named here, with the reason."""
+    assert len(FILES) > 50
     found = {}
     for name, file in FILES.items():
         found |= larger(name, file.read_text())
-    assert set(found) == LARGER, {name: found.get(name, "no longer") for name in set(found) ^ LARGER}
+    assert not found
 
 
 @pytest.mark.parametrize("docstring", ["Makes a part.", "Choose.", "Copies it", "Passes", "Tries", "Ends, and"])
@@ -152,12 +116,5 @@ def test_others_are_none(docstring):
 
 
 def test_docstrings_of_functions_begin_with_a_verb():
-    held = {name: file for name, file in FILES.items() if not name.startswith(NO_VERBS_YET)}
-    assert len(held) > 20
-    found = {name: without_verb(file.read_text()) for name, file in held.items()}
+    found = {name: without_verb(file.read_text()) for name, file in FILES.items()}
     assert not {name: functions for name, functions in found.items() if functions}
-
-
-@pytest.mark.parametrize("beginning", NO_VERBS_YET)
-def test_what_is_mended_leaves_the_list(beginning):
-    assert any(without_verb(file.read_text()) for name, file in FILES.items() if name.startswith(beginning))

@@ -5,8 +5,8 @@ import copy
 import numpy as np
 import pytest
 import torch
-from test_gradients import GROUPS, cloth, jittered, scaled, scene_for
-from test_integrators import colliding
+from inputs import GROUPS, cloth, colliding, jittered, scaled, scene_for
+from internals import gain_in_a_part, numbers, strips
 from warp_yarn.kernels.core.status import GAINED, STALLED
 
 import warp_yarn as wy
@@ -107,19 +107,8 @@ def test_a_damped_step(group: str) -> None:
     scene = scene_for(group, STEPS, stiffness=None if group == "exact pins" else 100.0)
     rollout = wt.Rollout(scene, STEPS, checkpoint_every=3, **EXACT)
     make_in_parts(rollout.simulator, {1: (GAINED, 0.6), 2: (STALLED, 0.6)})
-    fallback, gained = rollout.simulator.parts, []
-    attempt = fallback._try
-
-    def gains_once(method: object, count: object, size: float, left: float) -> bool:
-        """The first half of step 3."""
-        made = attempt(method, count, size, left)
-        if method is rollout.simulator.integrator and (size, left) == (0.5, 1.0):
-            rollout.simulator.arrays["status"].assign(np.array([GAINED, -1, 0], dtype=np.int32))
-            gained.append(size)
-            return False
-        return made
-
-    fallback._try = gains_once
+    # of the first half of step 3
+    gained = gain_in_a_part(rollout.simulator, 0.5, 1.0)
     check_directional_derivatives(rollout, CASES[group], jittered(scene.cloth, size=0.2), {2: 1e-3, 3: 5e-4}, {2, 3})
     assert gained
 
@@ -208,7 +197,7 @@ def test_a_second_backward_pass_and_a_copy_give_the_same() -> None:
     with torch.no_grad():
         rollout(shear=950.0, **fixed)
     assert torch.equal(torch.autograd.grad(loss, shear)[0], first) and first != 0.0
-    assert rollout.simulator.parts.watcher is None
+    assert rollout.simulator.substepping.watcher is None
     other = copy.deepcopy(rollout)
     make_in_parts(other.simulator, HALVED)
     again = (other(shear=shear, **fixed).position / 1e-3).square().sum()
@@ -223,7 +212,7 @@ def test_two_cores_take_parts_back_as_one_does() -> None:
         rollout = wt.Rollout(scene, STEPS, checkpoint_every=3, threads=threads, **EXACT)
         make_in_parts(rollout.simulator, {1: (GAINED, 0.6), 2: (STALLED, 0.6)})
         gradients.append(gradients_of(rollout, jittered(fabric, size=0.2), {2, 3}))
-    assert rollout.simulator.model.strips == 2
+    assert strips(rollout.simulator) == 2
     for found, expected in zip(*reversed(gradients), strict=True):
         # the same operations on every node; sums over nodes are added in another order
         assert (found - expected).abs().max() < 1e-9 * expected.abs().max()
@@ -237,8 +226,7 @@ def test_steps_that_are_made_again_are_not_watched_again(monkeypatch: pytest.Mon
     run_chunk, bounds = rollout.simulator.run_chunk, []
 
     def looked_at(steps: int) -> int:
-        arrays = rollout.simulator.arrays
-        bounds.append((float(arrays["bounds"].numpy()[0]), int(arrays["audit_due"].numpy()[0])))
+        bounds.append(tuple(numbers(rollout.simulator, name)[0] for name in ("bounds", "audit_due")))
         return run_chunk(steps)
 
     monkeypatch.setattr(rollout.simulator, "run_chunk", looked_at)

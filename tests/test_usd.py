@@ -1,14 +1,17 @@
 """USD files: what the validators of usd-core do not see, such as extents, counts, and which yarn is on top."""
 
+import dataclasses
 import os
 
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdValidation
+from scripts import load
 from waving import BLUE, RED, rotation, waving
 
 import warp_yarn as wy
 from warp_yarn.io import usd
+from warp_yarn.simulation.state import SHAPES
 from warp_yarn.view import geometry
 
 SINGLE = 8e-9
@@ -187,6 +190,130 @@ def test_usd_validates_it(tmp_path, tubes, ending):
     assert len(validators) > 10
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [(error.GetName(), error.GetMessage()) for error in errors] == []
+
+
+# -- obstacles -------------------------------------------------------------------------------------------------------
+
+
+touch = load("scenes/touch.py")
+TURN = np.append(np.sin(0.2) * np.array([0.6, 0.0, 0.8]), np.cos(0.2))
+TETRAHEDRON = (
+    1e-3 * np.array([[2, 2, 1], [2, -2, 1], [-3, 0, 1], [0, 0, -2]]),
+    [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
+)
+
+
+def obstacle(shape, **options):
+    """One about the origin that is 1 mm high or more, whatever way it is turned, and 3 mm at most."""
+    make = {
+        "plane": lambda **o: wy.Plane(point=(0, 0, 1e-3), normal=(0.1, -0.2, 1.0), **o),
+        "sphere": lambda **o: wy.Sphere(center=(0, 0, 0), radius=2e-3, **o),
+        "capsule": lambda **o: wy.Capsule(start=(-1e-3, 1e-3, 0), end=(1e-3, -1e-3, 5e-4), radius=1e-3, **o),
+        "cylinder": lambda **o: wy.Cylinder(start=(-1e-3, 1e-3, 0), end=(1e-3, -1e-3, 5e-4), radius=1.2e-3, **o),
+        "box": lambda **o: wy.Box(center=(0, 0, 0), half_extents=(2e-3, 1e-3, 1.2e-3), rotation=TURN, **o),
+        "mesh": lambda **o: wy.TriangleMesh(*TETRAHEDRON, rotation=TURN, **o),
+    }
+    return make[shape](**options)
+
+
+def still(cloth, scene):
+    """A trajectory of one frame, as the cloth is posed."""
+    frame = cloth.position[None]
+    euler = cloth.euler[None]
+    return wy.Trajectory(cloth, 1e-3, frame, euler, 0 * frame, 0 * euler, euler, scene=scene)
+
+
+def distance_to(prim, x, time):
+    """Of places in the world, from what the file says."""
+    to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time))
+    local = (np.c_[x, np.ones(len(x))] @ np.linalg.inv(to_world))[:, :3]
+    norm = np.linalg.norm
+    if prim.IsA(UsdGeom.Plane):
+        shape = UsdGeom.Plane(prim)
+        half = 0.5 * np.array([shape.GetWidthAttr().Get(), shape.GetLengthAttr().Get()])
+        assert (np.abs(local[:, :2]) <= half).all() and shape.GetAxisAttr().Get() == "Z"
+        return local[:, 2]
+    if prim.IsA(UsdGeom.Sphere):
+        return norm(local, axis=1) - UsdGeom.Sphere(prim).GetRadiusAttr().Get()
+    if prim.IsA(UsdGeom.Cube):
+        # out of a scaled cube, along the scaled axes
+        scale = norm(to_world[:3, :3], axis=1)
+        half = 0.5 * UsdGeom.Cube(prim).GetSizeAttr().Get() * scale
+        return norm(np.maximum(np.abs(local * scale) - half, 0.0), axis=1)
+    if prim.IsA(UsdGeom.Mesh):
+        mesh = UsdGeom.Mesh(prim)
+        corners = np.array(mesh.GetPointsAttr().Get(), dtype=float)[mesh.GetFaceVertexIndicesAttr().Get()]
+        return touch.to_triangles(local, corners.reshape(-1, 3, 3))
+    shape = (UsdGeom.Capsule if prim.IsA(UsdGeom.Capsule) else UsdGeom.Cylinder)(prim)
+    half, radius = 0.5 * shape.GetHeightAttr().Get(), shape.GetRadiusAttr().Get()
+    assert shape.GetAxisAttr().Get() == "Z"
+    if prim.IsA(UsdGeom.Capsule):
+        return norm(local - np.clip(local[:, 2:], -half, half) * [0, 0, 1], axis=1) - radius
+    by = np.stack([norm(local[:, :2], axis=1) - radius, np.abs(local[:, 2]) - half], axis=1)
+    return norm(np.maximum(by, 0.0), axis=1)
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_an_obstacle_is_drawn_where_cloth_touches_it(tmp_path, shape, moving):
+    """The simulator's places of contact are on the file's surface, at every frame."""
+    cloth = wy.paper.cloth(rows=5, columns=5, pose="flat")
+    flat = cloth.position - cloth.position.mean(axis=0)
+    k = np.arange(1, 4)[:, None]
+    first = obstacle(shape)
+    way = first.position + k * [2e-5, -1e-5, 1e-5]
+    q = first.rotation + 0.01 * k * [1.0, -2.0, 3.0, 1.0]
+    path = np.hstack([way, q / np.linalg.norm(q, axis=1, keepdims=True)])
+    there = obstacle(shape, path=path if moving else None, friction=0.25)
+    scene = wy.Scene(cloth, obstacles=[there])
+    [each] = geometry.placed(still(cloth, scene))
+    height = np.zeros(3)
+    for _ in range(20):
+        # down to where it touches
+        height[2] += 0.95e-3 - touch.distances(each, each.local(flat + height, 0)).min()
+    scene = scene.replace(cloth=cloth.replace(pose=flat + height))
+    touched = 0
+    for steps in (1, 2, 3):
+        simulator = wy.Simulator(scene, integrator="implicit-euler")
+        trajectory = simulator.run(steps)
+        wy.write_usd(tmp_path / "a.usdc", trajectory)
+        stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+        prim = stage.GetPrimAtPath(f"/obstacles/{shape}_0")
+        touching = simulator.contacts()
+        touched += len(touching)
+        # single precision of the scale of a box, and of the points of a mesh
+        np.testing.assert_allclose(distance_to(prim, touching.place, steps), 0.0, rtol=0, atol=2e-9)
+        moved = {op.GetOpName() for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if op.GetNumTimeSamples()}
+        assert moved == ({"xformOp:translate", "xformOp:orient"} if moving else set())
+        assert [prim.GetCustomDataByKey(key) for key in ("shape", "friction")] == [shape, 0.25]
+    assert touched
+
+
+def test_the_rectangle_of_a_plane_is_under_the_cloth_in_every_frame(tmp_path):
+    trajectory = waving(frames=6)
+    normal = np.array([1, 0.5, 2]) / 5.25**0.5
+    plane = wy.Plane(point=(0.3, 0.1, 0), normal=normal, path=[[0.3 + 0.002 * k, 0.1, 0] for k in range(6)])
+    trajectory = dataclasses.replace(trajectory, scene=wy.Scene(trajectory.cloth, obstacles=[plane]))
+    stage, _ = written(tmp_path / "a.usda", trajectory)
+    prim = stage.GetPrimAtPath("/obstacles/plane_0")
+    for frame in range(6):
+        expected = (trajectory.position[frame] - [0.3 + 0.002 * max(frame - 1, 0), 0.1, 0]) @ normal
+        # distance_to asserts that they are over it
+        np.testing.assert_allclose(distance_to(prim, trajectory.position[frame], frame), expected, rtol=0, atol=1e-15)
+    assert UsdGeom.Plane(prim).GetWidthAttr().Get() < 0.1
+
+
+def test_usd_validates_obstacles(tmp_path):
+    trajectory = waving()
+    several = [obstacle(shape, path=[[0, 0, 1e-4], [0, 0, 2e-4]]) for shape in SHAPES]
+    trajectory = dataclasses.replace(trajectory, scene=wy.Scene(trajectory.cloth, obstacles=several))
+    stage, _shapes = written(tmp_path / "a.usdc", trajectory)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [(error.GetName(), error.GetMessage()) for error in errors] == []
+    assert stage.GetDefaultPrim().GetPath() == "/cloth"
+    assert len(stage.GetPrimAtPath("/obstacles").GetChildren()) == 6
+    assert not written(tmp_path / "b.usdc", waving())[0].GetPrimAtPath("/obstacles")
 
 
 # -- tubes -----------------------------------------------------------------------------------------------------------

@@ -8,13 +8,15 @@ pickle that names it, has to register it too.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 from typing import Any
 
 import warp as wp
 
 from .description.scene import checked_parameter
-from .description.topology import Topology
+from .device.declarations import ASSEMBLY, FIELDS, INPUTS, PARAMETERS, STATE, TOPOLOGY
+from .device.declared import arguments
 from .device.exclusive import ALONE
 from .errors import InputError, choice, integer, real
 from .integrators import INTEGRATORS
@@ -27,9 +29,21 @@ STENCILS = (0, 2, 4, 6)
 SUMS_OF_ENERGY = ("", "elastic_energy", "height_energy")
 OTHER_INPUTS = ("sliding", "state", "steps_done", "forces", "pin_path")
 """What calls and ablations say beside the names of terms, parameters and arrays."""
+OF_FRICTION = {"anchor", "friction_force_out"}
+"""What there is with friction alone."""
+OF_STEPS = {"pin_target_path", "pin_start", "pin_motion", "applied_force_path"}
+"""What becomes an input of a step."""
+OF_THE_SYSTEM = {"rhs", "euler_rhs", "solution", "euler_solution"}
+"""What is made of what all terms write."""
+FOR_TERMS = {*TOPOLOGY, *PARAMETERS, *INPUTS, *STATE, *ASSEMBLY, "coefficients"}
+FOR_TERMS |= {"evaluations", "energy", "matrix", "add_contact_load"}
+FOR_TERMS -= OF_FRICTION | OF_STEPS | OF_THE_SYSTEM
+"""What kernels of a term from outside the package may take, beside their parameters."""
 METHOD = ("name", "order", "fallback", "local_error", "set_times", "advance", "prepare_adjoint", "backward_step")
 STAGES = ("fraction", "carried", "stages")
 """What a method has, and a StageMethod as well."""
+MAY_DAMP = re.compile(r"\bcoefficients\b(?!\s*:)(?!\[0\]\[[02]\])")
+"""Any use of the factors but one of M's or H's alone."""
 _OWN_METHODS = frozenset(INTEGRATORS)
 
 
@@ -45,7 +59,7 @@ def register_term(term: Term) -> None:
 
     Raises:
         InputError: a name that is taken or not allowed, an attribute or default that cannot be used, a kernel that is
-            none or has an argument that no array is called.
+            none or has an argument that it may not take.
     """
     if not isinstance(term, Term):
         raise InputError(f"term = {term!r}, must be a Term")
@@ -55,7 +69,7 @@ def register_term(term: Term) -> None:
         raise InputError(f"term = {term!r}: its parameters and their defaults must be tuples ({error})") from error
     with ALONE:
         kernels = build(Variant(wp.float64, True))
-        labels = {argument.label for kernel in kernels.values() for argument in kernel.adj.args}
+        labels = {*FIELDS, *(argument.label for kernel in kernels.values() for argument in kernel.adj.args)}
         taken = {*TERMS, *kernels, *OTHER_INPUTS}
         # every term may have a kernel of its name with _energy behind it
         of_energies = {f"{name}_energy" for name in TERMS} | {name.removesuffix("_energy") for name in taken}
@@ -171,31 +185,36 @@ def _check_parameter(term: Term, parameter: Any, taken: set[str]) -> None:
 def _check_kernel(term: Term, kernel: Any) -> None:
     if not isinstance(kernel, wp.Kernel):
         raise InputError(f"term {term.name!r} defines {kernel!r}, must be a kernel")
-    ours = build(Variant(wp.float64, True))
-    labels = [argument.label for argument in kernel.adj.args]
-    known = {argument.label for own_term in TERMS for argument in _arguments(ours, own_term)}
-    known |= {argument.label for argument in ours["contact_normal"].adj.args}
-    known |= {field.name for field in dataclasses.fields(Topology)} - {"node_yarns", "neighbour"}
-    # which there are with friction alone
-    known -= {"anchor", "friction_force_out"}
-    known |= {*parameters(), *(parameter.name for parameter in term.parameters)}
+    labels = arguments(kernel)
+    known = FOR_TERMS | set(parameters()) | {parameter.name for parameter in term.parameters}
     for label in labels:
         if label not in known:
             raise InputError(
-                f"term {term.name!r}: its kernel has an argument {label!r}, must be one of {', '.join(sorted(known))}"
+                f"term {term.name!r}: its kernel has an argument {label!r}, must be one of {', '.join(sorted(known))}, "
+                "or blocks: BlockMatrix"
             )
+    source = _source(kernel)
     least = {"upper_": 4 if term.elements == "bends" else 2, "corner_blocks": 6, "triangle_blocks": 6}
     for name, stencil in least.items():
-        if term.stencil < stencil and any(label.startswith(name) for label in labels):
+        if term.stencil < stencil and re.search(rf"\b{name}", source):
             raise InputError(f"term {term.name!r} has {name}..., stencil = {term.stencil}, must be at least {stencil}")
     if "normal" in labels and not term.needs_contact:
         raise InputError(f"term {term.name!r} reads the contact's normal, must have needs_contact=True")
     if "contact_load" in labels and not (term.needs_contact or term.presses):
         raise InputError(f"term {term.name!r} has contact_load, must have needs_contact=True or presses=True")
-    if "coefficients[0][1]" in kernel.adj.source and not term.explicit_in_ros2:
+    if MAY_DAMP.search(source) and not term.explicit_in_ros2:
         raise InputError(f"term {term.name!r} adds a damping, coefficients[0][1], must have explicit_in_ros2=True")
 
 
-def _arguments(kernels: dict[str, wp.Kernel], term: str) -> list[Any]:
-    """Arguments of the kernels of one of the package's terms."""
-    return [a for name in (term, f"{term}_energy") if name in kernels for a in kernels[name].adj.args]
+def _source(kernel: wp.Kernel) -> str:
+    """Collect the source of a kernel and of the Warp functions that it calls, and they call."""
+    found: dict[Any, str] = {}
+    waiting: list[Any] = [kernel]
+    while waiting:
+        part = waiting.pop()
+        if part not in found:
+            found[part] = part.adj.source
+            names = inspect.getclosurevars(part.func)
+            values = (*names.globals.values(), *names.nonlocals.values())
+            waiting += [value for value in values if isinstance(value, wp.Function) and not value.is_builtin()]
+    return "\n".join(found.values())

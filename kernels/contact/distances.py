@@ -5,9 +5,9 @@
     capsule, along z       φ = |x − z-axis within ±l| − r
     cylinder, along z      φ = |max((ρ − r, |z| − l), 0)|, ρ² = x² + y²
     box, half extents h    φ = |max(|x| − h, 0)|
-    triangle mesh          φ = |x − its closest point|, on both sides
+    triangle               φ = |x − its closest point|, on both sides
 
-All but the mesh are convex, so φ is a convex function, by which ``limits.py`` finds where a line first comes near.
+All are convex, so φ is a convex function, by which ``limits.py`` finds where a line first comes near.
 Cloth stays outside of φ = D > 0, where edges are round and the gradient has no jump; inside, φ of cylinder and box is
 that of the nearest face, as a place to complain of.
 
@@ -70,8 +70,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         return vec4(n[0], n[1], n[2], length - margin)
 
     @wp.func
-    def distance(shape: int, size: vec3, x: vec3, on_mesh: vec3) -> vec4:
-        """Compute (∇φ, φ) at x; ``on_mesh`` is the closest point of a mesh."""
+    def distance(shape: int, size: vec3, x: vec3) -> vec4:
+        """Compute (∇φ, φ) at x. A mesh is infinitely far away: its triangles are looked at one by one."""
         zero = scalar(0.0)
         one = scalar(1.0)
         if shape == wp.static(PLANE):
@@ -81,7 +81,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         if shape == wp.static(CAPSULE):
             return outside(vec3(x[0], x[1], x[2] - wp.clamp(x[2], -size[0], size[0])), size[1])
         if shape == wp.static(MESH):
-            return outside(x - on_mesh, zero)
+            return vec4(zero, zero, one, scalar(wp.static(float("inf"))))
         if shape == wp.static(CYLINDER):
             rho = wp.sqrt(x[0] * x[0] + x[1] * x[1])
             side = rho - size[1]

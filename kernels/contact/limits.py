@@ -21,6 +21,7 @@ from ..core.structs import structs
 from ..core.variant import Variant
 from ..linear.pair_blocks import IMPACTS, TOUCHES
 from . import barrier, obstacles
+from . import meshes as mesh_contact
 from .distances import MESH
 
 LEFT = 0.1
@@ -34,28 +35,36 @@ def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
     to_obstacle, obstacle_speed = obstacles.functions(variant).to_obstacle, obstacles.functions(variant).obstacle_speed
     note_motion = barrier.functions(variant).note_motion
-    Obstacles, Pairs = structs(variant).Obstacles, structs(variant).Pairs
+    Obstacles, Faces, Pairs = structs(variant).Obstacles, structs(variant).Faces, structs(variant).Pairs
+    vec4, to_face = variant.vec4, mesh_contact.functions(variant).to_face
     module = variant.module("contact_limits")
 
     @wp.func
-    def nearest_face(obstacles: Obstacles, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3) -> int:
-        """Find the face of a mesh that is closest to x: the search tree is in single precision, distances are not."""
+    def nearest(obstacles: Obstacles, faces: Faces, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3) -> vec4:
+        """Find (n, g) of a place and an obstacle; of a mesh that of its closest face: the search tree is in single
+        precision, distances are not."""
         if obstacles.obstacle_shape[k] != wp.static(MESH):
-            return 0
+            return to_obstacle(obstacles, k, x)
         local = wp.quat_rotate_inv(obstacles.obstacle_rotation[k], x - obstacles.obstacle_position[k])
         place = wp.vec3(float(local[0]), float(local[1]), float(local[2]))
         found = wp.mesh_query_point_no_sign(meshes[k], place, wp.static(1.0e10))
-        return obstacles.first_face[k] + found.face
+        return to_face(obstacles, faces, obstacles.first_face[k] + found.face, x)
 
     @wp.func
     def reach(
-        obstacles: Obstacles, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3, move: vec3, limit: scalar
+        obstacles: Obstacles,
+        faces: Faces,
+        meshes: wp.array(dtype=wp.uint64),
+        k: int,
+        x: vec3,
+        move: vec3,
+        limit: scalar,
     ) -> scalar:
         """Find the part of a move, 1 at most, before which φ stays above the limit."""
         gone = scalar(0.0)
         for _ in range(wp.static(PLACES)):
             place = x + move * gone
-            at = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, place), place)
+            at = nearest(obstacles, faces, meshes, k, place)
             room = at[3] - limit
             approach = -(at[0] * move[0] + at[1] * move[1] + at[2] * move[2])
             if obstacles.obstacle_shape[k] == wp.static(MESH):
@@ -81,20 +90,9 @@ def define(variant: Variant) -> SimpleNamespace:
         return obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
 
     @wp.kernel(module=module, enable_backward=False)
-    def find_faces(
-        obstacles: Obstacles,
-        meshes: wp.array(dtype=wp.uint64),
-        position: wp.array(dtype=vec3),
-        mesh_face: wp.array(dtype=int),
-    ):
-        """Find the face of each mesh that each node is closest to."""
-        e = index(wp.tid())
-        count = obstacles.obstacle_shape.shape[0]
-        mesh_face[e] = nearest_face(obstacles, meshes, e % count, position[e / count])
-
-    @wp.kernel(module=module, enable_backward=False)
     def limit_to_obstacles(
         obstacles: Obstacles,
+        faces: Faces,
         meshes: wp.array(dtype=wp.uint64),
         contact_distance: wp.array(dtype=scalar),
         stage_size: wp.array(dtype=scalar),
@@ -110,18 +108,19 @@ def define(variant: Variant) -> SimpleNamespace:
         k = index(e % count)
         x = position[i]
         if is_free[i] != 0:
-            gap = to_obstacle(obstacles, k, obstacles.mesh_face[e], x)[3]
+            gap = nearest(obstacles, faces, meshes, k, x)[3]
             limit = contact_distance[0] + scalar(wp.static(LEFT)) * (gap - contact_distance[0])
             move = direction[i] * stage_size[0]
             # most are far away
             if gap - wp.length(move) < limit:
-                part = reach(obstacles, meshes, k, x, move, limit)
+                part = reach(obstacles, faces, meshes, k, x, move, limit)
                 if part < scalar(1.0):
                     wp.atomic_min(step_length, 0, part)
 
     @wp.kernel(module=module, enable_backward=False)
     def start_outside(
         obstacles: Obstacles,
+        faces: Faces,
         meshes: wp.array(dtype=wp.uint64),
         obstacle_position_before: wp.array(dtype=vec3),
         obstacle_rotation_before: wp.array(dtype=quat),
@@ -145,28 +144,30 @@ def define(variant: Variant) -> SimpleNamespace:
         inside = int(0)
         for k in range(count):
             begin = taken(obstacles, k, obstacle_position_before, obstacle_rotation_before, position[i])
-            gap = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, begin), begin)[3]
+            gap = nearest(obstacles, faces, meshes, k, begin)[3]
             # seen from the obstacle, that is the way that a node goes which stays, or is held and sent elsewhere
             if is_free[i] == 0:
-                if reach(obstacles, meshes, k, begin, x - begin, distance) < scalar(1.0):
+                if reach(obstacles, faces, meshes, k, begin, x - begin, distance) < scalar(1.0):
                     inside = int(1)
-            elif reach(obstacles, meshes, k, begin, x - begin, distance + scalar(0.5) * (gap - distance)) < scalar(1.0):
+            elif reach(
+                obstacles, faces, meshes, k, begin, x - begin, distance + scalar(0.5) * (gap - distance)
+            ) < scalar(1.0):
                 x = begin
         if is_free[i] != 0:
             move = end - x
             part = scalar(1.0)
             goes = wp.length_sq(x - position[i]) > scalar(0.0)
             for k in range(count):
-                gap = to_obstacle(obstacles, k, nearest_face(obstacles, meshes, k, x), x)[3]
+                gap = nearest(obstacles, faces, meshes, k, x)[3]
                 if not (gap > distance):
                     inside = int(1)
                 elif goes:
                     # what takes it along may not take it through another one
                     begin = taken(obstacles, k, obstacle_position_before, obstacle_rotation_before, position[i])
-                    if reach(obstacles, meshes, k, begin, x - begin, distance) < scalar(1.0):
+                    if reach(obstacles, faces, meshes, k, begin, x - begin, distance) < scalar(1.0):
                         inside = int(1)
                 limit = distance + scalar(wp.static(LEFT)) * (gap - distance)
-                part = wp.min(part, reach(obstacles, meshes, k, x, move, limit))
+                part = wp.min(part, reach(obstacles, faces, meshes, k, x, move, limit))
             if part < scalar(1.0) or goes:
                 solution[i] = (x + move * part - base_position[i]) / stage_size[0]
         if inside != 0:
@@ -181,6 +182,8 @@ def define(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def note_obstacle_impacts(
         obstacles: Obstacles,
+        faces: Faces,
+        meshes: wp.array(dtype=wp.uint64),
         contact_distance: wp.array(dtype=scalar),
         contact_range: wp.array(dtype=scalar),
         step_size: wp.array(dtype=scalar),
@@ -196,7 +199,7 @@ def define(variant: Variant) -> SimpleNamespace:
         count = obstacles.obstacle_shape.shape[0]
         i = index(e / count)
         k = index(e % count)
-        at = to_obstacle(obstacles, k, obstacles.mesh_face[e], position[i])
+        at = nearest(obstacles, faces, meshes, k, position[i])
         n = vec3(at[0], at[1], at[2])
         v = velocity[i] - obstacle_speed(obstacles, k, position[i])
         later = v - increment[i] * (step_size[0] / stage_size[0] - scalar(1.0))
@@ -245,7 +248,6 @@ def define(variant: Variant) -> SimpleNamespace:
         refuse_impact=refuse_impact,
         ask_where_touching=ask_where_touching,
         copy_rotations=copy_rotations,
-        find_faces=find_faces,
         limit_to_obstacles=limit_to_obstacles,
         start_outside=start_outside,
     )

@@ -19,32 +19,19 @@ from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 from . import barrier, distances
 from .barrier import DISTANCE, RANGE
-from .distances import MESH
 
 
 @functools.cache
 def functions(variant: Variant) -> SimpleNamespace:
     vec3, vec4 = variant.vec3, variant.vec4
     Obstacles = structs(variant).Obstacles
-    distance, closest_on_triangle = (
-        distances.functions(variant).distance,
-        distances.functions(variant).closest_on_triangle,
-    )
+    distance = distances.functions(variant).distance
 
     @wp.func
-    def to_obstacle(obstacles: Obstacles, k: int, face: int, x: vec3) -> vec4:
-        """Find (n, g) of a place and an obstacle."""
+    def to_obstacle(obstacles: Obstacles, k: int, x: vec3) -> vec4:
+        """Find (n, g) of a place and an obstacle that is no mesh."""
         local = wp.quat_rotate_inv(obstacles.obstacle_rotation[k], x - obstacles.obstacle_position[k])
-        on_mesh = vec3()
-        if obstacles.obstacle_shape[k] == wp.static(MESH):
-            corner = 3 * face
-            on_mesh = closest_on_triangle(
-                local,
-                obstacles.mesh_corner[corner],
-                obstacles.mesh_corner[corner + 1],
-                obstacles.mesh_corner[corner + 2],
-            )
-        at = distance(obstacles.obstacle_shape[k], obstacles.obstacle_size[k], local, on_mesh)
+        at = distance(obstacles.obstacle_shape[k], obstacles.obstacle_size[k], local)
         n = wp.quat_rotate(obstacles.obstacle_rotation[k], vec3(at[0], at[1], at[2]))
         return vec4(n[0], n[1], n[2], at[3])
 
@@ -78,7 +65,6 @@ def define(variant: Variant) -> wp.Kernel:
         velocity: wp.array(dtype=vec3),
         increment: wp.array(dtype=vec3),
         step_size: wp.array(dtype=scalar),
-        evaluations: wp.array(dtype=int),
         # forces out, and whether anything touches
         force: wp.array(dtype=vec3),
         touching: wp.array(dtype=int),
@@ -92,7 +78,7 @@ def define(variant: Variant) -> wp.Kernel:
         law = law_of(contact_stiffness, contact_distance, contact_range, contact_slip_speed, contact_damping_speed)
         k = index(e % count)
         x = position[i]
-        at = to_obstacle(obstacles, k, obstacles.mesh_face[e], x)
+        at = to_obstacle(obstacles, k, x)
         gap = at[3]
         if gap < law[DISTANCE] + law[RANGE]:
             n = vec3(at[0], at[1], at[2])
@@ -101,7 +87,7 @@ def define(variant: Variant) -> wp.Kernel:
             note_contact(law, n, v, increment[i], step_size[0], touching)
             if matrix != 0:
                 friction = obstacles.obstacle_friction[k]
-                xx = contact_matrix(law, friction, gap, n, v, blocks.coefficients[0], evaluations[0])
+                xx = contact_matrix(law, friction, gap, n, v, blocks.coefficients[0], blocks.evaluations[0])
                 wp.atomic_add(blocks.diagonal_xx, i, xx)
 
     return obstacle_term
@@ -124,7 +110,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
     ):
         e = index(wp.tid())
         count = obstacles.obstacle_shape.shape[0]
-        gap = to_obstacle(obstacles, e % count, obstacles.mesh_face[e], position[e / count])[3]
+        gap = to_obstacle(obstacles, e % count, position[e / count])[3]
         reach = contact_range[0]
         x = (gap - contact_distance[0]) / reach
         if x < scalar(1.0):
@@ -144,9 +130,9 @@ def define_reports(variant: Variant) -> SimpleNamespace:
     module = variant.module("contact_reports")
 
     @wp.func
-    def force_on(obstacles: Obstacles, law: vec5, e: int, k: int, x: vec3, velocity: vec3) -> vec3:
+    def force_on(obstacles: Obstacles, law: vec5, k: int, x: vec3, velocity: vec3) -> vec3:
         """Compute the force on a node, 0 where it does not touch."""
-        at = to_obstacle(obstacles, k, obstacles.mesh_face[e], x)
+        at = to_obstacle(obstacles, k, x)
         result = vec3()
         if at[3] > law[DISTANCE] and at[3] < law[DISTANCE] + law[RANGE]:
             v = velocity - obstacle_speed(obstacles, k, x)
@@ -172,8 +158,8 @@ def define_reports(variant: Variant) -> SimpleNamespace:
         i = index(e / count)
         k = index(e % count)
         law = law_of(contact_stiffness, contact_distance, contact_range, contact_slip_speed, contact_damping_speed)
-        gaps[e] = to_obstacle(obstacles, k, obstacles.mesh_face[e], position[i])
-        contact_forces[e] = force_on(obstacles, law, e, k, position[i], velocity[i])
+        gaps[e] = to_obstacle(obstacles, k, position[i])
+        contact_forces[e] = force_on(obstacles, law, k, position[i], velocity[i])
 
     @wp.kernel(module=module, enable_backward=False)
     def add_obstacle_power(
@@ -193,7 +179,7 @@ def define_reports(variant: Variant) -> SimpleNamespace:
         i = index(e / count)
         k = index(e % count)
         law = law_of(contact_stiffness, contact_distance, contact_range, contact_slip_speed, contact_damping_speed)
-        f = force_on(obstacles, law, e, k, position[i], velocity[i])
+        f = force_on(obstacles, law, k, position[i], velocity[i])
         done = wp.dot(f, obstacle_speed(obstacles, k, position[i]))
         wp.atomic_add(power, 0, done)
         wp.atomic_add(power, 1, done)

@@ -48,7 +48,6 @@ def define(variant: Variant) -> wp.Kernel:
         velocity: wp.array(dtype=vec3),
         increment: wp.array(dtype=vec3),
         step_size: wp.array(dtype=scalar),
-        evaluations: wp.array(dtype=int),
         # forces out, and whether anything touches
         force: wp.array(dtype=vec3),
         touching: wp.array(dtype=int),
@@ -75,7 +74,9 @@ def define(variant: Variant) -> wp.Kernel:
                 note_contact(law, n, v, increment[p] - increment[q], step_size[0], touching)
                 touching[wp.static(PAIRS_TOUCH)] = 1
                 if matrix != 0:
-                    b = contact_matrix(law, contact_friction[0], gap, n, v, blocks.coefficients[0], evaluations[0])
+                    b = contact_matrix(
+                        law, contact_friction[0], gap, n, v, blocks.coefficients[0], blocks.evaluations[0]
+                    )
                     wp.atomic_add(blocks.diagonal_xx, p, b)
                     pairs.near_block[k] = sym33(b[0, 0], b[0, 1], b[0, 2], b[1, 1], b[1, 2], b[2, 2])
 

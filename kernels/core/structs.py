@@ -20,11 +20,13 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class BlockMatrix:
-        """The matrix (``linear/block_matrix.py`` tells its layout), and what M, D and H are multiplied by in it."""
+        """The matrix (``linear/block_matrix.py`` tells its layout), what M, D and H are multiplied by in it, and how
+        many evaluations there were in the stage: where Newton's iteration goes to and fro, terms fill it otherwise."""
 
         stencil: int
         neighbour: wp.array(dtype=int)
         coefficients: wp.array(dtype=vec3)
+        evaluations: wp.array(dtype=int)
         diagonal_xx: wp.array(dtype=mat33)
         diagonal_xs: wp.array(dtype=vec3)
         diagonal_ss: wp.array(dtype=scalar)
@@ -136,8 +138,7 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class Obstacles:
-        """Of each obstacle: shape, size, friction, pose, velocity ṗ and spin ω. Of a mesh: the first of its faces among
-        ``mesh_corner``, three to a face; and of each node and mesh the face to take the closest point from."""
+        """Of each obstacle: shape, size, friction, pose, velocity ṗ and spin ω; of a mesh the first of its faces."""
 
         obstacle_shape: wp.array(dtype=int)
         obstacle_size: wp.array(dtype=vec3)
@@ -147,12 +148,22 @@ def structs(variant: Variant) -> SimpleNamespace:
         obstacle_velocity: wp.array(dtype=vec3)
         obstacle_spin: wp.array(dtype=vec3)
         first_face: wp.array(dtype=int)
+
+    @wp.struct
+    class Faces:
+        """Of each face of all meshes three corners and its obstacle; of each node ``face_room`` places, of which
+        ``face_count`` are taken by faces that are near."""
+
+        face_room: int
         mesh_corner: wp.array(dtype=vec3)
-        mesh_face: wp.array(dtype=int)
+        face_obstacle: wp.array(dtype=int)
+        face_count: wp.array(dtype=int)
+        near_face: wp.array(dtype=int)
 
     return SimpleNamespace(
         Pairs=Pairs,
         Obstacles=Obstacles,
+        Faces=Faces,
         BlockMatrix=BlockMatrix,
         SolverWork=SolverWork,
         SolveReport=SolveReport,

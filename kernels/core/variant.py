@@ -68,7 +68,7 @@ class Variant:
         wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast"}, self.module(module))
 
     def kernel(self, module: str) -> Callable[[Callable], wp.Kernel]:
-        """Decorator of a kernel of this variant in one of its modules."""
+        """Decorate a kernel of this variant in one of its modules."""
         return wp.kernel(module=self.module(module), enable_backward=self.reverse)
 
 

@@ -10,9 +10,9 @@ couples positions alone. A slot that a scene's terms do not fill is not stored (
     diagonal_ss [2·node + d]  1        upper_sx [4·node + slot]        3       row s of node, column x of neighbour
                                        upper_ss [4·node + slot]        1
 
-Two preconditioners P. Here the diagonal of A (``jacobi``): every node on its own, so it is what a parallel machine
-wants. In ``incomplete.py`` one that takes a twelfth of the iterations, node after node, and in
-``conjugate_gradient.py`` the iteration with it.
+Three preconditioners P. Here the diagonal of A (``jacobi``), with an iteration in one thread. One that takes a
+fraction of the iterations is in ``incomplete_cholesky.py``, with its iteration in ``conjugate_gradient.py``; lines on
+many levels are in ``multilevel.py``, with theirs in ``multilevel_conjugate_gradient.py``.
 """
 
 import functools
@@ -181,11 +181,20 @@ def functions(variant: Variant) -> SimpleNamespace:
             subtract_transposed(i, blocks, -x, -u, -v, q_x, q_s)
 
     @wp.func
+    def limit_of(tolerance: wp.array(dtype=scalar), size: scalar, report: SolveReport) -> scalar:
+        """Compute down to where an iteration goes: nowhere once a step has failed, as a GPU's host hears of it late."""
+        if report.status[0] != 0:
+            return scalar(wp.static(float("inf")))
+        return tolerance[0] * tolerance[0] * size
+
+    @wp.func
     def write_report(count: int, rz: scalar, size: scalar, limit: scalar, report: SolveReport) -> bool:
-        """Write how the iteration ended; return whether it failed, and no step before it had."""
+        """Write how the iteration ended, unless a step before has failed; return whether it failed itself."""
+        if report.status[0] != 0:
+            return False
         report.iterations[0] = count
         report.residual[0] = wp.sqrt(wp.max(rz, scalar(0.0)) / wp.max(size, scalar(1.0e-30)))
-        if rz <= limit or report.status[0] != 0:
+        if rz <= limit:
             return False
         report.status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
         return True
@@ -195,6 +204,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         upper_product=upper_product,
         subtract_transposed=subtract_transposed,
         multiply=multiply,
+        limit_of=limit_of,
         write_report=write_report,
     )
 
@@ -202,7 +212,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
-    multiply, write_report = functions(variant).multiply, functions(variant).write_report
+    multiply, limit_of = functions(variant).multiply, functions(variant).limit_of
+    write_report = functions(variant).write_report
     module = variant.module("solver")
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
     SolveReport = structs(variant).SolveReport
@@ -272,7 +283,7 @@ def define(variant: Variant) -> SimpleNamespace:
                     work.q_s[s] = zero
 
         size = rz
-        limit = tolerance[0] * tolerance[0] * size
+        limit = limit_of(tolerance, size, report)
         count = int(0)
         while count < most_iterations and rz > limit:
             multiply(

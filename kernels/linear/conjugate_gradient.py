@@ -36,7 +36,7 @@ def define(variant: Variant) -> SimpleNamespace:
     load, store = memory.functions(variant).load, memory.functions(variant).store
     shared = block_matrix.functions(variant)
     times, upper_product, subtract_transposed = shared.times, shared.upper_product, shared.subtract_transposed
-    write_report = shared.write_report
+    limit_of, write_report = shared.limit_of, shared.write_report
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
     SolveReport, Pairs = structs(variant).SolveReport, structs(variant).Pairs
     add_pairs = pair_blocks.functions(variant).add_pairs
@@ -289,7 +289,7 @@ def define(variant: Variant) -> SimpleNamespace:
             arrived += threads
             size = rz
 
-            limit = tolerance[0] * tolerance[0] * size
+            limit = limit_of(tolerance, size, report)
             count = int(0)
             beta = zero
             while count < most_iterations and rz > limit:

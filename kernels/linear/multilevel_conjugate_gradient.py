@@ -79,7 +79,7 @@ _ROW = (
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
     load, store = memory.functions(variant).load, memory.functions(variant).store
-    write_report = block_matrix.functions(variant).write_report
+    limit_of, write_report = block_matrix.functions(variant).limit_of, block_matrix.functions(variant).write_report
     product = incomplete_cholesky.functions(variant).product
     total = synchronization.functions(variant).total
     precondition, barriers = multilevel.functions(variant).precondition, multilevel.functions(variant).barriers
@@ -164,7 +164,7 @@ def define(variant: Variant) -> SimpleNamespace:
             arrived += threads * (barriers(levels) + 1)
             rz = total(rz, 0, thread, threads, arrived, signals, work.sums)
             size = rz
-            limit = tolerance[0] * tolerance[0] * size
+            limit = limit_of(tolerance, size, report)
             count = int(0)
             beta = zero
             while count < most_iterations and rz > limit:

@@ -25,7 +25,7 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def add_pairs(pairs: Pairs, begin: int, end: int, x: wp.array(dtype=vec3), y: wp.array(dtype=vec3)) -> scalar:
-        """y += C x in a range of rows, and their part of x·C x."""
+        """Add y += C x in a range of rows, and return their part of x·C x."""
         energy = scalar(0.0)
         for p in range(begin, end):
             total = vec3()

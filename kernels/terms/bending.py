@@ -3,7 +3,7 @@
     V = k_b θ²/Δs,   k_b = B π R²,   Δs = s_b − s_a
     θ: the angle between t₁ and −t₂, with t₁ = dir(x_b − x_c) and t₂ = dir(x_a − x_c); 0 where the yarn is straight
 
-and between this and the k_b π²/Δs of a flat fold where a segment has shrunk to nearly a point (``vanishing.py``).
+and between this and the k_b π²/Δs of a flat fold where a segment has shrunk to nearly a point (``mollifier.py``).
 
 Parameters: ``bend`` B, bending modulus of each yarn [Pa m²] (the paper prints N/m); ``radius`` R and ``spacing`` L [m].
 

@@ -117,7 +117,6 @@ def define(variant: Variant) -> wp.Kernel:
         friction_force_out: wp.array(dtype=scalar),
         euler_momentum: wp.array(dtype=scalar),
         # matrix out
-        evaluations: wp.array(dtype=int),
         matrix: int,
         blocks: BlockMatrix,
     ):
@@ -141,7 +140,7 @@ def define(variant: Variant) -> wp.Kernel:
                 damping = blocks.coefficients[0][1] * friction_damping[0]
                 wp.atomic_add(euler_momentum, s, damping * euler_velocity[s])
                 slope = f[1]
-                if evaluations[0] > wp.static(CYCLING) and evaluations[0] % 2 == 0:
+                if blocks.evaluations[0] > wp.static(CYCLING) and blocks.evaluations[0] % 2 == 0:
                     delta = wp.abs(euler[s] - anchor[s])
                     slope = wp.max(slope, wp.abs(f[0]) / wp.max(delta, floor / friction_stiffness[0]))
                 wp.atomic_add(blocks.diagonal_ss, s, damping + blocks.coefficients[0][2] * slope)

@@ -9,7 +9,7 @@
 where the corner can jam (its crossing is flipped against both neighbours), and 1 elsewhere. The force is minus the
 gradient of the whole energy, dk/dφ included. Beyond the right angle γ is negative, which would turn eq. 5's stiffness
 negative near φ = π, so γ is taken as 0 there: γ³ stays twice differentiable. Where a neighbour is nearly at the place
-of the crossing, V is between this and the energy at φ = 0 (``vanishing.py``).
+of the crossing, V is between this and the energy at φ = 0 (``mollifier.py``).
 
 Parameters: ``shear`` S [Pa]; ``spacing`` L and ``radius`` R [m].
 

@@ -15,6 +15,7 @@ from warp_yarn.device.fields import Field
 
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
 STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAdjoint", "Levels"}
+STRUCTS |= {"Pairs", "Obstacles", "Faces"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
 """Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""
@@ -104,6 +105,10 @@ def test_what_is_not_declared_cannot_be_set():
     arrays = wy.Simulator(scene("plain", ("stretch",))).arrays
     with pytest.raises(KeyError, match="positoin"):
         arrays["positoin"] = arrays["position"]
+    with pytest.raises(KeyError, match="positoin"):
+        arrays.update(positoin=arrays["position"])
+    with pytest.raises(KeyError, match="positoin"):
+        arrays.setdefault("positoin", arrays["position"])
     with pytest.raises(TypeError, match="position"):
         arrays["position"] = arrays["euler"]
     with pytest.raises(TypeError, match="position"):

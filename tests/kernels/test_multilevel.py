@@ -8,7 +8,7 @@ import pytest
 from cases import make_state
 
 import warp_yarn as wy
-from warp_yarn.device.model import SOLVED
+from warp_yarn.device.threads import SOLVED
 from warp_yarn.presets.fabrics import FABRICS
 
 FEWEST, COARSEST = 3, 9

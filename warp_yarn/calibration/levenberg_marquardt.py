@@ -175,7 +175,7 @@ class LevenbergMarquardt:
         return step, self.loss - float(after @ after)
 
     def _try(self) -> bool:
-        """Steps, ever shorter until the loss falls. False: it did not, as far as this Jacobian goes."""
+        """Tries steps, ever shorter until the loss falls. False: it did not, as far as this Jacobian goes."""
         while True:
             step, predicted = self._step(self.damping)
             if np.abs(step).max() < SHORTEST_STEP:

@@ -15,6 +15,8 @@ import numpy as np
 from ..errors import InputError, choice, finite_array, real
 from .cloth import Fixed
 
+ROUNDING = 1e-15
+"""Of a length of 1: what was normalized stays as it is, to the last bit."""
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 SAMPLES = ("nodes",)
 METHODS = ("barrier",)
@@ -297,7 +299,7 @@ def unit_quaternion(name: str, value: Any) -> np.ndarray:
     length = float(np.linalg.norm(q))
     if abs(length - 1.0) > 1e-6:
         raise InputError(f"{name} = {q.tolist()} has length {length:g}, must be a rotation: a quaternion of length 1")
-    return q / length
+    return q / (length if abs(length - 1.0) > ROUNDING else 1.0)
 
 
 def _direction(name: str, value: Any) -> np.ndarray:
@@ -305,7 +307,7 @@ def _direction(name: str, value: Any) -> np.ndarray:
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise InputError(f"{name} is 0, must have a direction")
-    return vector / length
+    return vector / (length if abs(length - 1.0) > ROUNDING else 1.0)
 
 
 def _turn_z_to(n: np.ndarray) -> np.ndarray:

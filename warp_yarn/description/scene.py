@@ -92,9 +92,9 @@ class Scene(Fixed):
         self.pin_path = None if pin_path is None else finite_array("pin_path", pin_path, (None, len(self.pins), 3))
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
-        checked = self._checked_forces(forces)
+        checked = _checked_forces(forces)
         self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
-        self.force_path = self._force_path(checked)
+        self.force_path = _force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
         self._parameters = self._checked_parameters(parameters)
@@ -138,7 +138,7 @@ class Scene(Fixed):
         return {parameter.name: parameter for term in terms if not own(term) for parameter in term.parameters}
 
     def registered_value(self, name: str) -> np.ndarray:
-        """The value of one of ``registered``, given or by default: (), a vector (3), or of every material [yarns]."""
+        """Finds a value of ``registered``, given or by default: (), a vector (3), or of every material [yarns]."""
         parameter = self.registered[name]
         value = np.array(self._parameters.get(name, parameter.default), dtype=np.float64)
         return np.broadcast_to(value, (len(self.cloth.yarns),)) if parameter.of == "yarn" else value
@@ -179,33 +179,6 @@ class Scene(Fixed):
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
 
-    @staticmethod
-    def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
-        """Gives {node: 3 numbers, or steps × 3}."""
-        if forces is None:
-            return {}
-        if not isinstance(forces, Mapping):
-            raise InputError(f"forces = {forces!r}, must be a dictionary, {{node: 3 numbers, or steps × 3}}")
-        result = {}
-        for node, value in forces.items():
-            name = f"forces[{node!r}]"
-            try:
-                steps = np.ndim(value) == 2
-            except ValueError as error:  # ragged
-                raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
-            result[node] = finite_array(name, value, (None, 3) if steps else (3,))
-            result[node].setflags(write=False)
-        return result
-
-    @staticmethod
-    def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
-        """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
-        steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
-        path = np.zeros((steps + 1, len(forces), 3))
-        for k, value in enumerate(forces.values()):
-            path[: len(value) if value.ndim == 2 else steps + 1, k] = value
-        return path
-
     def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
         if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
             raise InputError(f"terms = {names!r}, must be a list of names")
@@ -222,7 +195,7 @@ class Scene(Fixed):
         return tuple(name for name in known if name in names or name == "mass")
 
     def _lacks(self, term: Term) -> str:
-        """Why the scene has no use for a term, or ""."""
+        """Says why the scene has no use for a term, or ""."""
         if term.sliding_only and not self.sliding:
             return "yarns do not slide (sliding=False)"
         for parameter in () if own(term) else term.parameters:
@@ -231,7 +204,7 @@ class Scene(Fixed):
         return term.absent(self) if term.absent is not None else ""
 
     def _checked_parameters(self, given: Any) -> dict[str, Any]:
-        """{name: value}, as ``checked_parameter`` leaves it."""
+        """Checks {name: value}, each as ``checked_parameter`` leaves it."""
         if given is None:
             return {}
         if not isinstance(given, Mapping):
@@ -252,10 +225,37 @@ class Scene(Fixed):
 
 
 def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> Any:
-    """A value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
+    """Checks a value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
     if parameter.size == 3:
         return tuple(finite_array(parameter.name, value, (3,)).tolist())
     if parameter.of == "yarn" and not np.isscalar(value):
         values = finite_array(parameter.name, value, (materials,)).tolist()
         return tuple(real(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
     return real(parameter.name, value, **parameter.range)
+
+
+def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
+    """Gives {node: 3 numbers, or steps × 3}."""
+    if forces is None:
+        return {}
+    if not isinstance(forces, Mapping):
+        raise InputError(f"forces = {forces!r}, must be a dictionary, {{node: 3 numbers, or steps × 3}}")
+    result = {}
+    for node, value in forces.items():
+        name = f"forces[{node!r}]"
+        try:
+            steps = np.ndim(value) == 2
+        except ValueError as error:  # ragged
+            raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
+        result[node] = finite_array(name, value, (None, 3) if steps else (3,))
+        result[node].setflags(write=False)
+    return result
+
+
+def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
+    """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
+    steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
+    path = np.zeros((steps + 1, len(forces), 3))
+    for k, value in enumerate(forces.values()):
+        path[: len(value) if value.ndim == 2 else steps + 1, k] = value
+    return path

@@ -9,6 +9,7 @@ import warp as wp
 
 from ..description.obstacles import TriangleMesh
 from ..description.scene import Scene
+from ..errors import InputError
 from ..kernels.contact import distances
 from . import declarations
 from .energy_watch import AT_START
@@ -24,8 +25,8 @@ NEAR_MARGIN = 0.5
 OBSTACLE_PATHS = ("obstacle_position_path", "obstacle_rotation_path")
 PLACED = ("obstacle_position", "obstacle_rotation", "obstacle_velocity", "obstacle_spin")
 """Arrays that follow from the paths at the time of a stage."""
-NEAR_ROOM = 32
-"""Nodes near each that there is room for at first."""
+NEAR_ROOM, FACE_ROOM = 32, 16
+"""Nodes and faces near each node that there is room for at first."""
 
 
 class Near(NamedTuple):
@@ -47,9 +48,9 @@ def sizes(scene: Scene) -> dict[str, int]:
         "obstacle": len(several),
         "obstacle step": _steps(scene) * len(several),
         "node obstacle": len(several) * scene.cloth.nodes,
-        # an array of no length has no gradient
-        "mesh corner": max(3 * faces, 1),
+        "face": max(faces, 1),
         "near": 0,
+        "near face": FACE_ROOM * scene.cloth.nodes if faces else 0,
     }
 
 
@@ -72,6 +73,7 @@ def set_arrays(arrays: Arrays) -> None:
         arrays["near_margin"] = arrays.numbers(NEAR_MARGIN * cloth.spacing)
         arrays["rest_place"] = arrays.numbers(cloth.rest_place.ravel())
     arrays["near_room"] = 0
+    arrays["face_room"] = FACE_ROOM if arrays.sizes["near face"] else 0
     arrays.make(declarations.CONTACT)
 
 
@@ -119,7 +121,11 @@ def _set_obstacles(arrays: Arrays, scene: Scene) -> None:
     ids = [0 if mesh is None else mesh.id for mesh in meshes]
     arrays["meshes"] = wp.array(ids, dtype=wp.uint64, device=arrays.device)
     arrays["first_face"] = wp.array(first, dtype=wp.int32, device=arrays.device)
-    arrays["mesh_corner"] = arrays.numbers(np.concatenate(corners) if corners else np.zeros((1, 3)))
+    # an array of no length has no gradient
+    arrays["mesh_corner"] = arrays.numbers(np.concatenate(corners) if corners else np.zeros((3, 3)))
+    counts = [len(obstacle.faces) if isinstance(obstacle, TriangleMesh) else 0 for obstacle in several]
+    of_face = np.repeat(np.arange(len(several)), counts) if corners else np.zeros(1)
+    arrays["face_obstacle"] = wp.array(of_face.astype(np.int32), dtype=wp.int32, device=arrays.device)
 
 
 def _quaternions(arrays: Arrays, values: np.ndarray) -> wp.array:
@@ -134,6 +140,7 @@ class Contact:
         on: whether the scene has any.
         obstacles_move: whether any obstacle has a path.
         damps_impacts: whether a method that has a fallback leaves steps with an impact to it.
+        has_mesh: whether any is a mesh.
     """
 
     damps_impacts = True
@@ -145,8 +152,10 @@ class Contact:
         self.on = self.obstacles or self.self_contact
         self.obstacles_move = "obstacles move" in model.arrays.conditions
         self._tapes: dict[int, wp.Tape] = {}
-        self._has_mesh = any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
+        self.has_mesh = "meshes" in scene.terms
         if self.self_contact:
+            if model.preconditioner == "jacobi":
+                raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
             a, cloth = model.arrays, scene.cloth
             self._reach = float(a["self_contact_distance"].numpy()[0] + a["self_contact_range"].numpy()[0])
             side = int(np.clip(np.sqrt(cloth.nodes) * cloth.spacing / self._reach, 8, 128))
@@ -155,20 +164,26 @@ class Contact:
             self.make_room(NEAR_ROOM)
 
     def make_room(self, room: int | None = None) -> None:
-        """Make room for so many nodes near each, or twice as many as there is; the next look makes a list."""
+        """Make room for so many nodes near each, or twice as many nodes and faces as there is; the next look makes a
+        list."""
         a = self.model.arrays
-        a["near_room"] = room or 2 * a["near_room"]
-        a.sizes["near"] = a["near_room"] * a["nodes"]
-        a["near"], a["near_block"] = a.new("near"), a.new("near_block")
-        # far from everywhere
-        a["near_position"].fill_(np.nan)
+        if self.self_contact:
+            a["near_room"] = room or 2 * a["near_room"]
+            a.sizes["near"] = a["near_room"] * a["nodes"]
+            a["near"], a["near_block"] = a.new("near"), a.new("near_block")
+            # far from everywhere
+            a["near_position"].fill_(np.nan)
+        if self.has_mesh and room is None:
+            a["face_room"] *= 2
+            a.sizes["near face"] = a["face_room"] * a["nodes"]
+            a["near_face"] = a.new("near_face")
 
     def find(self) -> None:
         """Look for what contact needs to know of the present positions."""
         if self.on:
             self.model.arrays.zero("touching")
-        if self._has_mesh:
-            self.model.launch("find_faces", "node_obstacles")
+        if self.has_mesh:
+            self.model.launch("find_faces", "nodes")
         if self.self_contact:
             self._keep_list(moves=False)
 
@@ -251,6 +266,8 @@ class Contact:
         """Add the power of moving obstacles to ``power``."""
         if self.obstacles_move:
             self.model.launch("add_obstacle_power", "node_obstacles")
+            if self.has_mesh:
+                self.model.launch("add_mesh_power", "nodes")
 
     # -- reports -----------------------------------------------------------------------------------------------------
 
@@ -261,6 +278,18 @@ class Contact:
         gaps, forces = self._reported("report_contacts", "node_obstacles", nodes * several)
         node, obstacle = np.divmod(np.arange(nodes * several), max(several, 1))
         return Near(node, np.full_like(node, -1), obstacle, gaps[:, 3], gaps[:, :3], forces)
+
+    def near_faces(self) -> Near:
+        """Report every node and face of a mesh that are near each other, and their force."""
+        a, nodes = self.model.arrays, self.model.scene.cloth.nodes
+        self.find()
+        room = a["face_room"]
+        gaps, forces = self._reported("report_faces", "nodes", nodes * room)
+        node, slot = np.divmod(np.arange(nodes * room), room)
+        kept = slot < a["face_count"].numpy()[node]
+        obstacle = a["face_obstacle"].numpy()[a["near_face"].numpy()[kept]]
+        node = node[kept]
+        return Near(node, np.full_like(node, -1), obstacle, gaps[kept, 3], gaps[kept, :3], forces[kept])
 
     def near_pairs(self) -> Near:
         """Report every two nodes that are near each other, and their force."""

@@ -177,7 +177,9 @@ CONTACT: Group = {
     "touching": Field("world", 3, "int", "", "always", "whether anything touches, two nodes, anything so fast"),
     "obstacle_velocity": Field("obstacle", 1, "vec3", "m/s", "obstacles", "ṗ"),
     "obstacle_spin": Field("obstacle", 1, "vec3", "rad/s", "obstacles", "ω"),
-    "mesh_face": Field("node obstacle", 1, "int", "", "obstacles", "face of a mesh that a node is closest to"),
+    "face_room": Field("count", 1, "int", "", "always", "places of a node in the list of faces that are near"),
+    "face_count": Field("node", 1, "int", "", "obstacles", "how many of them are taken"),
+    "near_face": Field("near face", 1, "int", "", "obstacles", "faces that are near it, of all meshes"),
     "near_room": Field("count", 1, "int", "", "always", "places of a node in the list of what is near"),
     "near_count": Field("node", 1, "int", "", "self-contact", "how many of them are taken"),
     "near": Field("near", 1, "int", "", "self-contact", "nodes that are near it"),
@@ -214,7 +216,8 @@ CONTACT_INPUTS: Group = {
     "obstacle_rotation_path": Field("obstacle step", 1, "quat", "", "obstacles move", "R"),
     "meshes": Field("obstacle", 1, "uint64", "", "obstacles", "Warp's mesh, or 0"),
     "first_face": Field("obstacle", 1, "int", "", "obstacles", "of a mesh, among all faces"),
-    "mesh_corner": Field("mesh corner", 1, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
+    "face_obstacle": Field("face", 1, "int", "", "obstacles", "the mesh of a face"),
+    "mesh_corner": Field("face", 3, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
 

@@ -1,5 +1,6 @@
 """Arrays by the names that kernels have for them: made, set, cleared and launched with as they are declared."""
 
+import collections
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ LARGE = 1 << 20
 """Bytes of an array."""
 
 
-class DeclaredArrays(dict[str, Any]):
+class DeclaredArrays(collections.UserDict[str, Any]):
     """Arrays of a variant on a device.
 
     Args:
@@ -152,9 +153,11 @@ class DeclaredArrays(dict[str, Any]):
             TypeError: the kernel has no argument of such a name.
             KeyError: it has an argument that is neither declared nor given.
         """
-        unknown = set(replaced) - _names(kernel)
+        unknown = set(replaced) - arguments(kernel)
         if unknown:
-            raise TypeError(f"{kernel.key} has no argument {', '.join(sorted(unknown))}, only {sorted(_names(kernel))}")
+            raise TypeError(
+                f"{kernel.key} has no argument {', '.join(sorted(unknown))}, only {sorted(arguments(kernel))}"
+            )
         dim = self.dims[elements] if isinstance(elements, str) else elements
         if dim:
             inputs = [self._argument(a.label, a.type, replaced) for a in kernel.adj.args]
@@ -162,7 +165,8 @@ class DeclaredArrays(dict[str, Any]):
 
     def taken(self, kernel: wp.Kernel, **offered: Any) -> dict[str, Any]:
         """Choose what a kernel has arguments for."""
-        return {name: value for name, value in offered.items() if name in _names(kernel)}
+        known = arguments(kernel)
+        return {name: value for name, value in offered.items() if name in known}
 
     def _argument(self, label: str, kind: Any, replaced: dict[str, Any]) -> Any:
         """Find what a kernel's argument is launched with; the fields of a struct are found as arguments are."""
@@ -190,10 +194,12 @@ class DeclaredArrays(dict[str, Any]):
         return self[label]
 
 
-def _names(kernel: wp.Kernel) -> set[str]:
-    """Find the names of a kernel's arguments, and of the fields of those that are structs."""
-    fields = (name for a in kernel.adj.args if isinstance(a.type, Struct) for name in a.type.vars)
-    return {a.label for a in kernel.adj.args} | set(fields)
+def arguments(kernel: wp.Kernel) -> set[str]:
+    """Find the names of a kernel's arguments; in place of a struct those of its fields."""
+    names: set[str] = set()
+    for argument in kernel.adj.args:
+        names |= set(argument.type.vars) if isinstance(argument.type, Struct) else {argument.label}
+    return names
 
 
 def arrays_of(launch: Any) -> list[wp.array]:

@@ -5,7 +5,6 @@ What a time step is made of, without saying how: that is for ``integrators``.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from typing import Any
 
@@ -18,10 +17,12 @@ from ..kernels import TERMS, Term, Variant, build
 from . import defaults
 from .arrays import Arrays
 from .contact import Contact
+from .declarations import INPUTS
+from .declared import arguments
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
 from .inputs import Inputs
-from .threads import Threads
+from .threads import SOLVED, Threads
 
 MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
@@ -29,8 +30,6 @@ MATRIX = (
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
 BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
 """Arrays that an assembly passes through, whose adjoints start at 0."""
-SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
-"""What differs from one linear solve to another."""
 
 
 class Model:
@@ -72,25 +71,23 @@ class Model:
         if preconditioner is None:
             preconditioner = defaults.preconditioner(scene, self.step_size)
         self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
-        if scene.self_contact and preconditioner == "jacobi":
-            raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
         exact = differentiable and precision == "double"
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
         self.tolerance = real("tolerance", tolerance, above=0.0)
         if newton_tolerance is None and exact:
             newton_tolerance = defaults.EXACT
-        given = newton_tolerance is not None
-        self._newton_tolerance = real("newton_tolerance", newton_tolerance, above=0.0) if given else None
+        if newton_tolerance is not None:
+            newton_tolerance = real("newton_tolerance", newton_tolerance, above=0.0)
+        self._newton_tolerance = newton_tolerance
         if max_iterations is None:
             max_iterations = defaults.max_iterations(scene)
         self.max_iterations = integer("max_iterations", max_iterations, least=1)
         self.device = _checked_device(device)
-        for name in scene.terms:  # one may have been registered when the scene was made
-            choice("scene.terms", name, TERMS)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
-        self.kernels = build(variant, scene.terms)
+        self.kernels = _kernels(scene, variant)
         self.arrays = Arrays(scene, variant, self.device)
+        _check_inputs(self)
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
         self.inputs = Inputs(self)
@@ -103,9 +100,8 @@ class Model:
 
     def newton_tolerance_at(self, step: float) -> float:
         """Give the tolerance that was asked for, or what follows the error of steps of this size [s]."""
-        if self._newton_tolerance is not None:
-            return self._newton_tolerance
-        return defaults.newton_tolerance(self.scene, self.precision, step)
+        given = self._newton_tolerance
+        return defaults.newton_tolerance(self.scene, self.precision, step) if given is None else given
 
     def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
         """Sets the times of the step that kernels make.
@@ -211,10 +207,6 @@ class Model:
         options = {} if self.preconditioner == "jacobi" else {"thread": thread}
         self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
 
-    def threads_at_hand(self) -> contextlib.AbstractContextManager[None]:
-        """Keep other processor cores at hand for linear solves, for as long as a block lasts."""
-        return self.threads.at_hand(SOLVED)
-
     def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
         a = self.arrays
@@ -249,6 +241,22 @@ def _checked_device(device: Any) -> Any:
     except Exception as error:
         names = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"device = {device!r}, must be one of {names}") from error
+
+
+def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
+    """Builds the kernels of a scene's terms, of which one may have been registered when the scene was made."""
+    for name in scene.terms:
+        choice("scene.terms", name, TERMS)
+    return build(variant, scene.terms)
+
+
+def _check_inputs(model: Model) -> None:
+    """Refuses a term that takes what acts on other cloths, and not on this one."""
+    for term in model.arrays.terms:
+        for name in (term.name, f"{term.name}_energy"):
+            taken = arguments(model.kernels[name]) if name in model.kernels else set()
+            for lacking in sorted(taken & set(INPUTS) - set(model.arrays)):
+                raise InputError(f"scene.terms has {term.name!r}, which takes {lacking!r}: the scene has none")
 
 
 def _factorize_levels(model: Model) -> None:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 NARROWEST = 8
 """Columns of a thread's part of the cloth; the sweeps need 3 at least, and fewer than these do not pay."""
+SOLVED = ("rhs", "euler_rhs", "tolerance", "solution", "euler_solution")
+"""Arrays that differ from one linear solve to another."""
 COUNT, WAITING, ENDED = 3, 4, 2
 """Places in the array of signals: how many threads, the last helper to wait, whether helpers are to end."""
 
@@ -61,23 +63,19 @@ class Threads:
 
     def solve(self, arrays: dict[str, Any]) -> None:
         """Launch the first thread's part of a solve; the helpers were launched before, with arrays of their own."""
-        model, own = self.model, self._own(arrays)
+        model, own = self.model, self._own()
         for name, array in arrays.items():
             model.arrays.copy_into(own[name], array)
         model.launch_solve(0, own)
         for name in ("solution", "euler_solution"):
             model.arrays.copy_into(arrays[name], own[name])
 
-    def _own(self, names: Any) -> dict[str, Any]:
-        return {name: self.model.arrays[f"helper_{name}"] for name in names}
+    def _own(self) -> dict[str, Any]:
+        return {name: self.model.arrays[f"helper_{name}"] for name in SOLVED}
 
     @contextlib.contextmanager
-    def at_hand(self, names: tuple[str, ...]) -> Iterator[None]:
-        """Keep the helpers at hand for linear solves, for as long as a block lasts.
-
-        Args:
-            names: of the arrays that differ from one solve to another.
-        """
+    def at_hand(self) -> Iterator[None]:
+        """Keep the helpers at hand for linear solves, for as long as a block lasts."""
         if self.count == 1:
             yield
             return
@@ -86,7 +84,7 @@ class Threads:
         helpers = []
         try:
             for thread in range(1, self.count):
-                arguments = (thread, self._own(names))
+                arguments = (thread, self._own())
                 helpers.append(threading.Thread(target=self.model.launch_solve, args=arguments, daemon=True))
                 helpers[-1].start()
                 while signals[WAITING] != thread and helpers[-1].is_alive():

@@ -86,7 +86,7 @@ class Adjoint:
             GradientError: where an adjoint is not finite, or its solve does not converge.
         """
         self.arrays.put("counters", steps, before + first + steps)
-        with self.simulator.model.threads_at_hand():
+        with self.simulator.model.threads.at_hand():
             for k in range(steps, 0, -1):
                 self._backward(self.simulator.integrator, first + k)
 
@@ -110,7 +110,7 @@ class Adjoint:
         try:
             method.set_times(size * h, left * h)
             self.arrays.put("counters", 1, before + step)
-            with self.simulator.model.threads_at_hand():
+            with self.simulator.model.threads.at_hand():
                 self._backward(method, step)
         finally:
             self.simulator.integrator.set_times(h, h)

@@ -113,6 +113,8 @@ class StageAdjoint:
 
     def _enter(self) -> None:
         self.model.arrays.zero_grad(*MOVED, *BETWEEN)
+        # the matrix is that of a first evaluation, whatever was counted before
+        self.model.arrays.zero("evaluations")
         self.model.launch("enter_stage", "nodes")
         self.method.newton.assemble(matrix=True)
         self.model.factorize()

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..description.obstacles import TriangleMesh
 from ..errors import InputError, integer, real
 from ..simulation.state import Trajectory
-from ..view.geometry import Strands, Tubes, strands
+from ..view.geometry import OBSTACLE_COLOR, Placed, Strands, Tubes, placed, strands
 from .files import atomic_write
 
 if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
-    from pxr import UsdGeom
+    from pxr import Gf, Usd, UsdGeom
 
 ENDINGS = (".usd", ".usda", ".usdc")
 COARSE = 1e-4
@@ -32,13 +33,17 @@ def write_usd(
     slowdown: float = 1.0,
     sides: int = 8,
 ) -> None:
-    """Writes every frame of a trajectory as a USD file: /cloth, and below it one prim for each yarn material.
+    """Writes every frame of a trajectory as a USD file: /cloth, and below it one prim for each yarn material; and
+    /obstacles, where there are any, and below it one prim for each.
 
     Yarns are cubic Catmull-Rom curves (``UsdGeom.BasisCurves``) with their end points repeated, as wide as the yarn,
     over and under each other as the draft says. Frame k is at time code k. Lengths are in metres, z is up.
     Points are in single precision. Where that would be too coarse, far from the origin, they are relative to a
     translation of /cloth, which is in double precision. The file appears whole or not at all; stages of this process
     that have an older one open show the new one.
+
+    Obstacles are of the kind that USD has for their shape, a box a scaled cube, and a plane a rectangle beneath the
+    cloth. Those that move have a translation and a rotation for each frame. Their custom data say shape and friction.
 
     Args:
         path: of the file, ending in .usd, .usda (text) or .usdc (binary).
@@ -60,7 +65,8 @@ def write_usd(
     parts = strands(trajectory)
     with atomic_write(path) as temporary, writing(path):
         # a function of its own, so that no stage holds the file when it is moved: Windows would not move it
-        _write_stage(temporary, trajectory, parts, tubes=tubes, rate=1.0 / (trajectory.step * slowdown), sides=sides)
+        rate = 1.0 / (trajectory.step * slowdown)
+        _write_stage(temporary, trajectory, parts, placed(trajectory), tubes=tubes, rate=rate, sides=sides)
     reload(path)
 
 
@@ -87,7 +93,14 @@ def reload(path: str | os.PathLike) -> None:
 
 
 def _write_stage(
-    path: Path, trajectory: Trajectory, parts: list[Strands], *, tubes: bool, rate: float, sides: int
+    path: Path,
+    trajectory: Trajectory,
+    parts: list[Strands],
+    obstacles: list[Placed],
+    *,
+    tubes: bool,
+    rate: float,
+    sides: int,
 ) -> None:
     from pxr import Gf, Usd, UsdGeom
 
@@ -116,7 +129,48 @@ def _write_stage(
             _write_mesh(UsdGeom.Mesh.Define(stage, prim_path), shape, part, origin)
         else:
             _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, radius, origin)
+    if obstacles:
+        UsdGeom.Scope.Define(stage, "/obstacles")
+    for k, each in enumerate(obstacles):
+        _write_obstacle(stage, f"/obstacles/{each.obstacle.shape}_{k}", each)
     stage.Save()
+
+
+def _write_obstacle(stage: Usd.Stage, path: str, placed: Placed) -> None:
+    from pxr import Gf, Usd, UsdGeom, Vt
+
+    obstacle = placed.obstacle
+    kinds = {"plane": "Plane", "sphere": "Sphere", "capsule": "Capsule", "cylinder": "Cylinder", "box": "Cube"}
+    shape = getattr(UsdGeom, kinds.get(obstacle.shape, "Mesh")).Define(stage, path)
+    translate = shape.AddTranslateOp()
+    turn = shape.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    for frame in range(len(placed.position)) if placed.moves else (0,):
+        time = [frame] if placed.moves else []
+        translate.Set(Gf.Vec3d(*placed.position[frame].tolist()), *time)
+        x, y, z, w = placed.rotation[frame].tolist()
+        turn.Set(Gf.Quatd(w, x, y, z), *time)
+    if obstacle.shape == "plane":
+        shape.CreateWidthAttr(placed.width)
+        shape.CreateLengthAttr(placed.length)
+        shape.CreateDoubleSidedAttr(True)
+    elif obstacle.shape == "box":
+        shape.CreateSizeAttr(2.0)
+        shape.AddScaleOp().Set(Gf.Vec3f(*obstacle.size.tolist()))
+    elif obstacle.shape == "sphere":
+        shape.CreateRadiusAttr(float(obstacle.size[0]))
+    elif isinstance(obstacle, TriangleMesh):
+        shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(obstacle.vertices.astype(np.float32)))
+        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(obstacle.faces), 3, dtype=np.int32)))
+        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(obstacle.faces.ravel()))
+        shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        shape.CreateDoubleSidedAttr(True)
+    else:
+        shape.CreateHeightAttr(2.0 * float(obstacle.size[0]))
+        shape.CreateRadiusAttr(float(obstacle.size[1]))
+    # z, as of planes: what the schemas have by default
+    shape.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(shape), Usd.TimeCode.Default()))
+    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([_linear(OBSTACLE_COLOR)])
+    shape.GetPrim().SetCustomData({"shape": obstacle.shape, "friction": obstacle.friction})
 
 
 def origins(trajectory: Trajectory) -> np.ndarray:
@@ -161,11 +215,18 @@ def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndar
 
 def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:
     """Writes a yarn's colour, which is that of a screen (sRGB), as displayColor, which is linear."""
-    from pxr import Gf, UsdGeom
+    from pxr import UsdGeom
 
-    color = np.array(part.color, dtype=np.float64)
-    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*linear.tolist())])
+    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([_linear(part.color)])
+
+
+def _linear(color: Sequence[float]) -> Gf.Vec3f:
+    """Makes a displayColor, which is linear, of a colour; those of yarns are those of a screen (sRGB)."""
+    from pxr import Gf
+
+    screen = np.array(color, dtype=np.float64)
+    linear = np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
+    return Gf.Vec3f(*linear.tolist())
 
 
 def _write_points(shape: UsdGeom.PointBased, frame: int, points: np.ndarray, margin: float) -> None:

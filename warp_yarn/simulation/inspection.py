@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -83,16 +84,18 @@ class Inspection:
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
             if contact.obstacles:
                 found.append(contact.near_obstacles())
+            if contact.has_mesh:
+                found.append(self._with_room(contact.near_faces))
             if contact.self_contact:
-                found.append(self._near_pairs())
+                found.append(self._with_room(contact.near_pairs))
         return contacts_of(found, position)
 
-    def _near_pairs(self) -> Near:
-        """Reports the nodes that are near each other, with room for all of them."""
-        found = self.model.contact.near_pairs()
+    def _with_room(self, report: Callable[[], Near]) -> Near:
+        """Reports what is near, with room for all of it."""
+        found = report()
         while int(self.model.arrays["status"].numpy()[0]) == CROWDED:
             self.stepper.make_room()
-            found = self.model.contact.near_pairs()
+            found = report()
         return found
 
     @alone
@@ -103,11 +106,16 @@ class Inspection:
             InputError: the two places that are nearest, and how near.
         """
         contact = self.model.contact
+        if not contact.on:
+            return
         with _Visit(self.stepper, state):
-            found = [self._near_pairs()] if contact.self_contact else []
+            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move
             where_known = state is None or not contact.obstacles_move
-            found += [contact.near_obstacles()] if contact.obstacles and where_known else []
+            if where_known and contact.obstacles:
+                found.append(contact.near_obstacles())
+            if where_known and contact.has_mesh:
+                found.append(self._with_room(contact.near_faces))
         for near in found:
             if len(near.gap):
                 gap, least, words = self._nearest(near)
@@ -119,8 +127,9 @@ class Inspection:
         """Tells what is nearest to a node of the present state, of what it may touch, or ""."""
         contact = self.model.contact
         with _Visit(self.stepper, None, ahead=True):
-            found = [self._near_pairs()] if contact.self_contact else []
+            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             found += [contact.near_obstacles()] if contact.obstacles else []
+            found += [self._with_room(contact.near_faces)] if contact.has_mesh else []
         told = []
         for near in found:
             mine = (near.node == node) | (near.other == node)
@@ -171,6 +180,7 @@ class Inspection:
         """
         h = self.model.step_size
         with _Visit(self.stepper, state, ahead=True):
+            self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return read_system(self.model)

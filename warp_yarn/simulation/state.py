@@ -11,13 +11,16 @@ import numpy as np
 
 from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
 from ..description.cloths import Cloths
+from ..description.obstacles import Box, Capsule, Contact, Cylinder, Obstacle, Plane, Sphere, TriangleMesh
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
-from ..errors import InputError, finite_array, integer, real
+from ..errors import InputError, choice, finite_array, integer, real
 from ..io.files import atomic_write
 
-FORMAT = 2
-"""Of recordings: 1 had no number, no scene and no count of steps."""
+FORMAT = 3
+"""Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth."""
+
+SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
 
 @dataclasses.dataclass(eq=False)
@@ -146,26 +149,13 @@ class Trajectory:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes an .npz file with the cloth, its scene and every frame; it appears whole or not at all."""
-        cloth = self.cloth
-        if isinstance(cloth, Cloths):
-            raise InputError("a recording of several cloths cannot be saved yet; write_usd can")
-        yarns = np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns])
-        colors = np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns])
-        numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
         with atomic_write(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
                 format=FORMAT,
                 start=self.start,
-                draft=cloth.weave.flipped,
-                weave=cloth.weave.name,
-                yarns=yarns,
-                colors=colors,
-                warp=cloth.warp,
-                weft=cloth.weft,
-                rest=cloth.position,
                 step=self.step,
-                **numbers,
+                **_packed_cloths(self.cloth),
                 **{name: getattr(self, name) for name in FIELDS},
                 **({} if self.scene is None else _packed(self.scene)),
             )
@@ -178,18 +168,7 @@ class Trajectory:
                 written = integer("format", data["format"].item(), least=1) if "format" in data else 1
                 if written > FORMAT:
                     raise InputError(f"format = {written}, this warp_yarn reads up to {FORMAT}: it needs a newer one")
-                yarns = [
-                    Yarn(density=d, stretch=s, bend=b, color=None if np.isnan(color).any() else tuple(color.tolist()))
-                    for (d, s, b), color in zip(data["yarns"].tolist(), data["colors"], strict=True)
-                ]
-                cloth = Cloth(
-                    Weave(data["draft"], str(data["weave"])),
-                    yarns=yarns,
-                    warp=data["warp"].tolist(),
-                    weft=data["weft"].tolist(),
-                    pose=data["rest"],
-                    **{name: data[name].item() for name in CLOTH_NUMBERS},
-                )
+                cloth = _unpacked_cloths(data)
                 frames = len(np.atleast_1d(data["position"]))
                 if not frames:
                     raise InputError("has no frame, must have at least one")
@@ -211,6 +190,54 @@ class Trajectory:
             raise InputError(f"{Path(path)}: not a recording of warp_yarn ({error})") from error
 
 
+def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
+    """Packs a cloth into arrays; of several each with its number before their names."""
+    if isinstance(cloth, Cloths):
+        parts = [_packed_cloths(each) for each in cloth.cloths]
+        return {"cloths": len(parts)} | {
+            f"cloth_{k}_{name}": parts[k][name] for k in range(len(parts)) for name in parts[k]
+        }
+    given = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
+    if cloth._arguments["friction_damping"] is None:
+        given["friction_damping"] = np.nan  # of its own mass, also where others are beside it
+    return {
+        "draft": cloth.weave.flipped,
+        "weave": cloth.weave.name,
+        "yarns": np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns]),
+        "colors": np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns]),
+        "warp": cloth.warp,
+        "weft": cloth.weft,
+        "rest": cloth.position,
+        **given,
+    }
+
+
+def _unpacked_cloths(data: Any) -> Cloth | Cloths:
+    """Makes what ``_packed_cloths`` made arrays of."""
+    if "cloths" in data:
+        count = integer("cloths", data["cloths"].item(), least=1)
+        return Cloths([_unpacked_cloth(data, f"cloth_{k}_") for k in range(count)])
+    return _unpacked_cloth(data, "")
+
+
+def _unpacked_cloth(data: Any, of: str) -> Cloth:
+    yarns = [
+        Yarn(density=d, stretch=s, bend=b, color=None if np.isnan(color).any() else tuple(color.tolist()))
+        for (d, s, b), color in zip(data[f"{of}yarns"].tolist(), data[f"{of}colors"], strict=True)
+    ]
+    numbers = {name: data[f"{of}{name}"].item() for name in CLOTH_NUMBERS}
+    if np.isnan(numbers["friction_damping"]):
+        numbers["friction_damping"] = None
+    return Cloth(
+        Weave(data[f"{of}draft"], str(data[f"{of}weave"])),
+        yarns=yarns,
+        warp=data[f"{of}warp"].tolist(),
+        weft=data[f"{of}weft"].tolist(),
+        pose=data[f"{of}rest"],
+        **numbers,
+    )
+
+
 def _packed(scene: Scene) -> dict[str, Any]:
     """Packs a scene into arrays; what is None is left out."""
     wind = scene.wind
@@ -227,11 +254,17 @@ def _packed(scene: Scene) -> dict[str, Any]:
         **{f"force_{node}": force for node, force in scene.forces.items()},
         "parameters": list(scene.parameters) or None,
         **{f"parameter_{name}": values for name, values in scene.parameters.items()},
+        "self_contact": scene.self_contact,
+        # None is a value of its own there, not always the default
+        **{f"contact_{name}": np.nan if value is None else value for name, value in scene.contact._arguments.items()},
+        "obstacles": np.array([obstacle.shape for obstacle in scene.obstacles], dtype=str),
     }
+    for k, obstacle in enumerate(scene.obstacles):
+        values.update({f"obstacle_{k}_{name}": value for name, value in obstacle._arguments.items()})
     return {f"scene_{name}": value for name, value in values.items() if value is not None}
 
 
-def _unpacked(cloth: Cloth, data: Any) -> Scene:
+def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
     """Makes the scene that ``_packed`` made arrays of."""
 
     def value(name: str) -> Any:
@@ -250,4 +283,24 @@ def _unpacked(cloth: Cloth, data: Any) -> Scene:
         terms=value("terms").tolist(),
         published_scaling=value("published_scaling").item(),
         parameters={} if named is None else {name: value(f"parameter_{name}").tolist() for name in named.tolist()},
+        obstacles=_unpacked_obstacles(data),
+        self_contact="scene_self_contact" in data and value("self_contact").item(),
+        contact=Contact(**_arguments(data, "contact")),
     )
+
+
+def _unpacked_obstacles(data: Any) -> list[Obstacle]:
+    """Makes the obstacles, of which recordings of before have none."""
+    shapes = data["scene_obstacles"].tolist() if "scene_obstacles" in data else []
+    return [
+        SHAPES[choice("obstacles", shape, SHAPES)](**_arguments(data, f"obstacle_{k}"))
+        for k, shape in enumerate(shapes)
+    ]
+
+
+def _arguments(data: Any, group: str) -> dict[str, Any]:
+    """Gives what something was made of: arrays, and numbers and names as such; NaN is None."""
+    start = f"scene_{group}_"
+    found = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+    values = {name: array if array.ndim else array.item() for name, array in found.items()}
+    return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}

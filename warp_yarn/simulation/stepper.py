@@ -150,7 +150,7 @@ class Stepper:
                 refuse_recording(self.model.device)
                 self.settle()
                 if self.model.threads.count > 1:
-                    uninterrupted(lambda: self._team.enter_context(self.model.threads_at_hand()))
+                    uninterrupted(lambda: self._team.enter_context(self.model.threads.at_hand()))
             return self._make_steps(steps)
         finally:
             self._end_team()
@@ -207,12 +207,6 @@ class Stepper:
         self.substepping.forget_graphs()
         self.arrays.put("status", 0, 0, 0)
 
-    def _make_room(self, frame: int) -> None:
-        """Makes room, and goes back to a frame."""
-        self.make_room()
-        self.frames.restore(frame)
-        self._count(frame)
-
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
         ledger = {name: self.arrays[name].numpy().copy() for name in LEDGER if name in self.arrays}
@@ -220,7 +214,9 @@ class Stepper:
         self._step_in_parts = _StepInParts(frame, parts.counts, ledger)
         gained, damped, whole = False, parts.damped, parts.allowed is None
         while whole and self._status() == CROWDED:
-            self._make_room(frame)
+            self.make_room()
+            self.frames.restore(frame)
+            self._count(frame)
             self.integrator.advance()
             if not self._status():
                 self._step_in_parts = None

@@ -13,6 +13,7 @@ import warp as wp
 
 from ..description.cloth import Cloth
 from ..description.cloths import Cloths
+from ..description.obstacles import Obstacle, TriangleMesh
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..errors import InputError, finite_array
 from ..kernels import Variant, build
@@ -20,6 +21,15 @@ from ..simulation.state import Trajectory
 
 PALETTE = ((0.13, 0.56, 0.57), (0.96, 0.49, 0.37), (0.93, 0.75, 0.36), (0.36, 0.36, 0.60), (0.60, 0.65, 0.68))
 """Colours of yarns that name none: teal and coral as in figure 5 of the paper, then sand, indigo and grey."""
+
+OBSTACLE_COLOR = (0.62, 0.60, 0.57)
+"""Of all obstacles, sRGB: a grey that no yarn has by default."""
+
+PLANE_MARGIN = 0.15
+"""How far the rectangle that stands for a plane goes beyond what is above it, over the longer side of that."""
+
+BACK = np.array([-1.0, -1.0, -1.0, 1.0])
+"""Times a quaternion (x, y, z, w): what turns back."""
 
 CATMULL_ROM = 0.5 * np.array(
     [[0.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [2.0, -5.0, 4.0, -1.0], [-1.0, 3.0, -3.0, 1.0]]
@@ -122,6 +132,110 @@ class Tubes:
         )
         corners = np.repeat([4, self.sides], [quads.shape[0] * self.sides, 2 * len(end)])
         return corners, np.concatenate([quads.ravel(), caps.ravel()])
+
+
+@dataclasses.dataclass(frozen=True)
+class Placed:
+    """An obstacle, and where it is drawn."""
+
+    obstacle: Obstacle
+    position: np.ndarray
+    """[frames, 3] (m): of its origin; of a plane, the middle of the rectangle that stands for it."""
+    rotation: np.ndarray
+    """[frames, 4]: quaternions (x, y, z, w)."""
+    width: float
+    length: float
+    """Along x and y, of a plane's rectangle [m]; of others 0."""
+
+    @property
+    def moves(self) -> bool:
+        return bool((self.position != self.position[0]).any() or (self.rotation != self.rotation[0]).any())
+
+    def world(self, points: np.ndarray) -> np.ndarray:
+        """Takes points of the obstacle's own frame [points, 3] at every frame [frames, points, 3]."""
+        return self.position[:, None] + _turned(self.rotation[:, None], points[None])
+
+    def local(self, points: np.ndarray, frame: int) -> np.ndarray:
+        """Places [points, 3] in the obstacle's own frame."""
+        return _turned(self.rotation[frame] * BACK, points - self.position[frame])
+
+    def matrix(self, frame: int) -> np.ndarray:
+        """Makes the matrix [4, 4] from its own frame to the world."""
+        result = np.eye(4)
+        result[:3, :3] = _turned(self.rotation[frame], np.eye(3)).T
+        result[:3, 3] = self.position[frame]
+        return result
+
+    def corners(self) -> np.ndarray:
+        """Gives the corners of a box around it in its own frame [8, 3] (m); of a plane, of its rectangle [4, 3]."""
+        obstacle = self.obstacle
+        low, high = np.zeros(3), np.zeros(3)
+        if obstacle.shape == "plane":
+            high[:2] = 0.5 * self.width, 0.5 * self.length
+        elif isinstance(obstacle, TriangleMesh):
+            low, high = obstacle.vertices.min(axis=0), obstacle.vertices.max(axis=0)
+        elif obstacle.shape == "box":
+            high = obstacle.size
+        elif obstacle.shape == "sphere":
+            high = np.full(3, obstacle.size[0])
+        else:
+            half, radius, _ = obstacle.size
+            high = np.array([radius, radius, half + (radius if obstacle.shape == "capsule" else 0.0)])
+        if obstacle.shape != "mesh":
+            low = -high
+        return np.unique(np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T, axis=0)
+
+
+def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]:
+    """Lists the obstacles of a trajectory's scene.
+
+    Args:
+        at: when its frames are, in steps since the first frame of the run [frames], which need not be whole; None: 0,
+            1, 2, ...
+    """
+    if trajectory.scene is None:
+        return []
+    at = np.arange(len(trajectory)) if at is None else np.asarray(at)
+    points = trajectory.position
+    result = []
+    for obstacle in trajectory.scene.obstacles:
+        position, rotation = _poses(obstacle, trajectory.start + at)
+        width = length = 0.0
+        if obstacle.shape == "plane":
+            # a rectangle of its own, which moves as it does, under all of the cloth at all times
+            local = _turned(rotation[:, None] * BACK, points - position[:, None])[..., :2]
+            low, high = local.min(axis=(0, 1)), local.max(axis=(0, 1))
+            width, length = (high - low + 2.0 * PLANE_MARGIN * (high - low).max()).tolist()
+            position = position + _turned(rotation, np.append(0.5 * (low + high), 0.0))
+        result.append(Placed(obstacle, position, rotation, width, length))
+    return result
+
+
+def _poses(obstacle: Obstacle, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Computes poses after so many steps: at constant velocity and spin from the end of one to that of the next."""
+    path = np.append(obstacle.position, obstacle.rotation)[None]
+    if obstacle.path is not None:
+        path = np.concatenate([path, obstacle.path])
+    steps = np.clip(steps, 0, len(path) - 1)
+    before = steps.astype(int)
+    after = np.minimum(before + 1, len(path) - 1)
+    share = (steps - before)[:, None]
+    position = (1.0 - share) * path[before, :3] + share * path[after, :3]
+    q, r = path[before, 3:], path[after, 3:]
+    cosine = (q * r).sum(axis=1, keepdims=True)
+    r = np.where(cosine < 0.0, -r, r)
+    angle = np.arccos(np.minimum(np.abs(cosine), 1.0))
+    sine = np.maximum(np.sin(angle), np.finfo(float).tiny)
+    small = angle < 1e-6
+    of_q = np.where(small, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
+    of_r = np.where(small, share, np.sin(share * angle) / sine)
+    return position, of_q * q + of_r * r
+
+
+def _turned(q: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Gives points turned by quaternions (x, y, z, w)."""
+    twice = 2.0 * np.cross(q[..., :3], points)
+    return points + q[..., 3:] * twice + np.cross(q[..., :3], twice)
 
 
 def strands(trajectory: Trajectory) -> list[Strands]:

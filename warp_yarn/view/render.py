@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import tqdm
 
+from ..description.obstacles import TriangleMesh
 from ..errors import InputError, finite_array, integer, real
 from ..io.files import atomic_write
 from ..simulation.state import Trajectory
-from .geometry import Tubes, checked, strands
+from .geometry import OBSTACLE_COLOR, Placed, Tubes, checked, placed, strands
 
 VIEW = (0.8, 1.0, 0.4)
 SIDES, SAMPLES = 16, 6
@@ -28,6 +29,10 @@ LENS = 24.0
 MARGIN = 1.08
 """Size of the picture over that of what is in it."""
 BACKGROUND = "#dbdee3"
+ROUND = 96
+"""Facets around an obstacle that is round."""
+SURROUNDINGS = 0.15
+"""How far about the yarns obstacles are in view, over the largest extent of these: what is beyond may be cut off."""
 OVERSAMPLING = 5.0**0.5
 """Of VTK's anti-aliasing, along either axis."""
 SURFACE = {"ambient": 0.15, "diffuse": 0.9, "specular": 0.12, "specular_power": 12}
@@ -44,7 +49,8 @@ def write_png(
     size: Sequence[int] = (1280, 960),
     view: Sequence[float] = VIEW,
 ) -> None:
-    """Draws one frame of a trajectory: every yarn a smooth tube in the colour of its material.
+    """Draws one frame of a trajectory: every yarn a smooth tube in the colour of its material; and the obstacles, of a
+    plane a rectangle beneath the cloth.
 
     Needs ``warp_yarn[render]``. The same picture is the same to the last pixel on one machine. The file appears whole
     or not at all.
@@ -67,7 +73,8 @@ def write_png(
     if not isinstance(frame, int | np.integer) or not -frames <= frame < frames:
         raise InputError(f"frame = {frame!r}, must be a whole number from {-frames} to {frames - 1}")
     shown = dataclasses.replace(trajectory, position=position[[frame]])
-    with atomic_write(path) as temporary, _Picture(shown, size, view) as picture:
+    at = np.array([range(frames)[frame]])
+    with atomic_write(path) as temporary, _Picture(shown, size, view, at) as picture:
         picture.drawn(0, temporary)
 
 
@@ -84,7 +91,8 @@ def write_mp4(
     """Draws a trajectory as a movie (H.264), seen by a camera that stands still.
 
     Picture k shows time k / (frames_per_second · slowdown); between two frames of the trajectory every node is taken
-    to move along a straight line. Needs ``warp_yarn[render]``. The file appears whole or not at all.
+    to move along a straight line, and every obstacle to move and turn steadily. Needs ``warp_yarn[render]``. The file
+    appears whole or not at all.
 
     Args:
         path: of the movie, ending in .mp4.
@@ -107,8 +115,10 @@ def write_mp4(
         raise InputError(f"size = {size}, must be even in a movie")
     imageio = _extra("imageio.v2")
     _extra("imageio_ffmpeg")
-    movie = dataclasses.replace(trajectory, position=_resampled(checked(trajectory), apart / trajectory.step))
-    with atomic_write(path) as temporary, _Picture(movie, size, view) as picture:
+    position = checked(trajectory)
+    at = _times(len(position), apart / trajectory.step)
+    movie = dataclasses.replace(trajectory, position=_resampled(position, apart / trajectory.step))
+    with atomic_write(path) as temporary, _Picture(movie, size, view, at) as picture:
         # Blocks of 2, since H.264 needs even sizes only and imageio would scale to multiples of 16.
         writer = imageio.get_writer(temporary, fps=rate, codec="libx264", quality=8, macro_block_size=2)
         with writer:
@@ -117,13 +127,19 @@ def write_mp4(
 
 
 class _Picture:
-    """The yarns in a scene of PyVista, and a camera that has every frame in view."""
+    """The yarns and obstacles in a scene of PyVista, and a camera that has the yarns of every frame in view, and of the
+    obstacles what is near. ``at``: as of ``placed``."""
 
-    def __init__(self, trajectory: Trajectory, size: tuple[int, int], view: Sequence[float]):
+    def __init__(
+        self, trajectory: Trajectory, size: tuple[int, int], view: Sequence[float], at: np.ndarray | None = None
+    ):
         parts = strands(trajectory)
         radius = trajectory.cloth.radius
+        self.obstacles = placed(trajectory, at)
         points = np.concatenate([part.points for part in parts], axis=1).reshape(-1, 3)
-        camera = _Camera.framing(points, radius, size[0] / size[1], view)
+        around = [each.world(each.corners()).reshape(-1, 3) for each in self.obstacles]
+        shown = [np.clip(corners, *_surroundings(points)) for corners in around]
+        camera = _Camera.framing(np.concatenate([points, *shown]), radius, size[0] / size[1], view)
         pv = _pyvista()
         self.tubes = [Tubes.around(part, radius, sides=SIDES, samples=SAMPLES) for part in parts]
         self.plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
@@ -138,6 +154,13 @@ class _Picture:
             self.meshes.append(mesh)
             actor = self.plotter.add_mesh(mesh, color=part.color, **SURFACE)
             actor.prop.interpolation = "Phong"
+        self.actors = [
+            self.plotter.add_mesh(_surface(pv, each), color=OBSTACLE_COLOR, smooth_shading=True, split_sharp_edges=True)
+            for each in self.obstacles
+        ]
+        for actor in self.actors:
+            for name, value in SURFACE.items():
+                setattr(actor.prop, name, value)
         for place, intensity in LIGHTS:
             position = camera.world(camera.distance * np.array(place))
             self.plotter.add_light(pv.Light(position=position, focal_point=camera.world(), intensity=intensity))
@@ -145,7 +168,7 @@ class _Picture:
         self.plotter.camera.focal_point = camera.world()
         self.plotter.camera.up = camera.axes[1]
         self.plotter.camera.view_angle = LENS
-        self.plotter.camera.clipping_range = camera.clipping
+        self.plotter.camera.clipping_range = camera.clipping_with(np.concatenate([points, *around]), radius)
         self.plotter.enable_anti_aliasing("ssaa")
         # Yarns darken where others are near: without it one does not see which lies over which.
         self.plotter.enable_ssao(radius=3.0 * radius, bias=0.1 * radius, kernel_size=16)
@@ -170,6 +193,8 @@ class _Picture:
         for mesh, tubes in zip(self.meshes, self.tubes, strict=True):
             mesh.points = tubes.vertices(frame)
             mesh.point_data.active_normals = tubes.normals(frame)
+        for actor, each in zip(self.actors, self.obstacles, strict=True):
+            actor.user_matrix = each.matrix(frame)
         self.plotter.render()
         return self.plotter.screenshot(path, return_img=True)
 
@@ -201,16 +226,51 @@ class _Camera:
         reach = np.abs(seen[:, 2]).max() + 2.0 * radius
         return cls(axes, centre, distance, (max(distance - reach, 0.01 * distance), distance + reach))
 
+    def clipping_with(self, points: np.ndarray, radius: float) -> tuple[float, float]:
+        """Sets how near and far it sees, to have points in the picture that it was not framed for."""
+        depth = self.distance - (points @ self.axes[2] - self.centre[2])
+        near = max(depth.min() - 2.0 * radius, 0.01 * self.distance)
+        return min(self.clipping[0], near), max(self.clipping[1], depth.max() + 2.0 * radius)
+
     def world(self, place: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
         """Finds a place seen from the centre along the axes, in the cloth's coordinates."""
         return (self.centre + np.asarray(place)) @ self.axes
 
 
+def _surroundings(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the box [3], [3] (m) in which obstacles are to be in view, about all that is drawn of the yarns."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    more = SURROUNDINGS * (high - low).max()
+    return low - more, high + more
+
+
+def _surface(pv: Any, placed: Placed) -> Any:
+    """Makes an obstacle in its own frame, as a mesh of PyVista."""
+    obstacle, axis = placed.obstacle, (0.0, 0.0, 1.0)
+    if isinstance(obstacle, TriangleMesh):
+        return pv.PolyData(obstacle.vertices, faces=np.insert(obstacle.faces, 0, 3, axis=1))
+    if obstacle.shape == "plane":
+        return pv.Plane(direction=axis, i_size=placed.width, j_size=placed.length)
+    if obstacle.shape == "box":
+        x, y, z = obstacle.size
+        return pv.Box((-x, x, -y, y, -z, z))
+    if obstacle.shape == "sphere":
+        return pv.Sphere(radius=obstacle.size[0], theta_resolution=ROUND, phi_resolution=ROUND)
+    half, radius, _ = obstacle.size
+    if obstacle.shape == "cylinder":
+        return pv.Cylinder(direction=axis, radius=radius, height=2.0 * half, resolution=ROUND)
+    return pv.Capsule(direction=axis, radius=radius, cylinder_length=2.0 * half, resolution=ROUND)
+
+
+def _times(frames: int, apart: float) -> np.ndarray:
+    """Lists 0, apart, 2 apart, ... up to the last frame."""
+    # Where a picture falls on the last frame, rounding must not lose it.
+    return np.arange(np.floor((frames - 1) / apart + 1e-9) + 1.0) * apart
+
+
 def _resampled(position: np.ndarray, apart: float) -> np.ndarray:
     """Interpolates positions at frames 0, apart, 2 apart, ... up to the last, in between them along straight lines."""
-    last = len(position) - 1
-    # Where a picture falls on the last frame, rounding must not lose it.
-    at = np.arange(np.floor(last / apart + 1e-9) + 1.0) * apart
+    last, at = len(position) - 1, _times(len(position), apart)
     before = np.minimum(at.astype(int), last)
     after = np.minimum(before + 1, last)
     share = (at - before)[:, None, None]
