@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -115,7 +116,6 @@ def shapes(friction: float = 0.3) -> dict[str, tuple[wy.Obstacle, Callable[[Tens
     normal = TURNED.apply((0.0, 0.0, 1.0))
     half = np.array([2e-3, 3e-3, 1e-3])
     vertices, faces = ICOSAHEDRON
-    corners = tensor(TURNED.apply(vertices) + at)
     options = {"friction": friction}
     p, q = tensor(at), tensor(end)
     return {
@@ -135,9 +135,21 @@ def shapes(friction: float = 0.3) -> dict[str, tuple[wy.Obstacle, Callable[[Tens
         ),
         "mesh": (
             wy.TriangleMesh(vertices, faces, position=at, rotation=QUATERNION, **options),
-            lambda x: torch.stack([to_triangle(x, *corners[list(face)]) for face in faces]).min(dim=0).values,
+            lambda x: torch.stack([distance(x) for distance in faces_of_mesh()]).min(dim=0).values,
         ),
     }
+
+
+def faces_of_mesh() -> list[Callable[[Tensor], Tensor]]:
+    """Distances from each face of the mesh among ``shapes``, all of which push."""
+    vertices, faces = ICOSAHEDRON
+    corners = tensor(TURNED.apply(vertices) + np.array([1e-3, -2e-3, 3e-3]))
+    return [functools.partial(to_triangle, a=a, b=b, c=c) for a, b, c in (corners[list(face)] for face in faces)]
+
+
+def parts_of(name: str) -> list[Callable[[Tensor], Tensor]]:
+    """What pushes of one of ``shapes``: itself, or each of its faces."""
+    return faces_of_mesh() if name == "mesh" else [shapes()[name][1]]
 
 
 SHAPES = ("plane", "sphere", "capsule", "cylinder", "box", "mesh")

@@ -7,13 +7,14 @@ import pytest
 import torch
 from checks import check_definite, error
 from reference import tensor
-from touching import SHAPES, TURNED, gradient, law_of, paper, places_near, posed, shapes
+from touching import SHAPES, TURNED, gradient, law_of, paper, parts_of, places_near, posed, shapes
 
 import warp_yarn as wy
 
 CLOTH = paper(5, 5)
 UP = TURNED.apply((0.0, 0.0, 1.0))
 """The plane's normal."""
+TERMS = {shape: ["obstacles", "meshes"] if shape == "mesh" else ["obstacles"] for shape in SHAPES}
 ROUNDING = 1e-11
 """Of forces by logarithms of gaps as small as a hundredth of their range, of places 1e-2 m away: 1e-16 · 1e-2/1e-5 · a
 few."""
@@ -25,8 +26,14 @@ def scene_on(shape: str, friction: float = 0.3, damping_speed: float | None = 0.
     contact = wy.Contact(damping_speed=damping_speed, slip_speed=0.1)
     obstacle = shapes(friction)[shape][0]
     far = CLOTH.replace(pose=CLOTH.position + UP)
-    scene = wy.Scene(far, obstacles=[obstacle], contact=contact, terms=["obstacles"], sliding=False, gravity=None)
+    scene = wy.Scene(far, obstacles=[obstacle], contact=contact, terms=TERMS[shape], sliding=False, gravity=None)
     return wy.Simulator(scene, integrator="implicit-euler")
+
+
+def force_of(simulator: wy.Simulator, state: wy.State) -> np.ndarray:
+    """Of the obstacle, on every node."""
+    forces = simulator.forces(state)
+    return forces["obstacles"][0] + forces.get("meshes", (0.0,))[0]
 
 
 def touching_state(shape: str, *, speed: float = 0.3) -> wy.State:
@@ -41,12 +48,12 @@ def touching_state(shape: str, *, speed: float = 0.3) -> wy.State:
 
 def expected_force(shape: str, state: wy.State, friction: float, damping_speed: float | None):
     """As a function of velocities."""
-    gap, n = gradient(shapes()[shape][1], state.position)
+    parts = [gradient(distance, state.position) for distance in parts_of(shape)]
     law = law_of(scene_on(shape, friction, damping_speed), friction)
-    return lambda v: law.force(gap, n, v)
+    return lambda v: sum(law.force(gap, n, v) for gap, n in parts)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", [shape for shape in SHAPES if shape != "mesh"])
 def test_distance_and_normal(shape: str) -> None:
     """Those of places near and far, inside what touches and beyond: ``report_contacts`` looks at all."""
     simulator, distance = scene_on(shape), shapes()[shape][1]
@@ -71,21 +78,39 @@ def test_distance_and_normal(shape: str) -> None:
             assert np.abs(slope - near.normal[:, k])[smooth].max() < 1e-4
 
 
+def test_faces_that_are_near() -> None:
+    """All of a mesh that may push, with their distances and normals, and no other."""
+    simulator = scene_on("mesh")
+    law = law_of(simulator, 0.3)
+    places = places_near(shapes()["mesh"][1], CLOTH.nodes, 1e-5, 1.5e-3)
+    simulator.stepper.frames.upload(posed(CLOTH, places))
+    near = simulator.model.contact.near_faces()
+    parts = [gradient(distance, places) for distance in parts_of("mesh")]
+    gap, n = np.array([gap.numpy() for gap, _ in parts]).T, np.array([n.numpy() for _, n in parts]).swapaxes(0, 1)
+    touch = law.distance + law.range
+    assert np.array_equal(np.bincount(near.node, minlength=CLOTH.nodes), (gap < touch).sum(axis=1))
+    for node in range(CLOTH.nodes):
+        mine, its = near.node == node, gap[node] < touch
+        order, other = np.argsort(near.gap[mine]), np.argsort(gap[node, its])
+        assert np.abs(near.gap[mine][order] - gap[node, its][other]).max(initial=0.0) < 1e-16
+        # faces that meet in an edge are as near as each other, and from there in the same direction
+        assert np.abs(near.normal[mine][order] - n[node, its][other]).max(initial=0.0) < 1e-10
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_energy_and_force(shape: str) -> None:
     """The energy, the force of what rests, which is minus its gradient, and that of what moves."""
     state, simulator = touching_state(shape), scene_on(shape)
-    distance, law = shapes()[shape][1], law_of(scene_on(shape), 0.3)
-    x = tensor(state.position).requires_grad_()
-    energy = law.energy(distance(x)).sum()
+    law, x = law_of(scene_on(shape), 0.3), tensor(state.position).requires_grad_()
+    energy = sum(law.energy(distance(x)).sum() for distance in parts_of(shape))
     (slope,) = torch.autograd.grad(energy, x)
     assert simulator.energy(state)["contact"] == pytest.approx(energy.item(), rel=ROUNDING)
-    at_rest = simulator.forces(posed(CLOTH, state.position))["obstacles"][0]
+    at_rest = force_of(simulator, posed(CLOTH, state.position))
     assert error(at_rest, -slope.numpy()) < ROUNDING
     assert (np.abs(slope.numpy()).max(axis=1) > 0.0).sum() > 10
     for friction, damping_speed in ((0.3, 0.5), (0.0, 0.5), (0.6, None)):
         expected = expected_force(shape, state, friction, damping_speed)(tensor(state.velocity))
-        moving = scene_on(shape, friction, damping_speed).forces(state)["obstacles"][0]
+        moving = force_of(scene_on(shape, friction, damping_speed), state)
         assert error(moving, expected.numpy()) < ROUNDING
 
 

@@ -225,7 +225,7 @@ def test_solution_is_that_of_the_dense_system(preconditioner: str, threads: int,
             a["euler_rhs"].assign(b[n:])
             a["euler_solution"].assign(0.0 * b[n:])
         a.put("tolerance", 1e-11)
-        with model.threads_at_hand() if threads > 1 else np.errstate():
+        with model.threads.at_hand() if threads > 1 else np.errstate():
             model.solve()
         found = numbers(simulator, "solution").ravel()
         if sliding:

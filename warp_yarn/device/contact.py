@@ -139,8 +139,8 @@ class Contact:
     Attributes:
         on: whether the scene has any.
         obstacles_move: whether any obstacle has a path.
-        has_mesh: whether any is a mesh.
         damps_impacts: whether a method that has a fallback leaves steps with an impact to it.
+        has_mesh: whether any is a mesh.
     """
 
     damps_impacts = True
@@ -152,7 +152,7 @@ class Contact:
         self.on = self.obstacles or self.self_contact
         self.obstacles_move = "obstacles move" in model.arrays.conditions
         self._tapes: dict[int, wp.Tape] = {}
-        self.has_mesh = any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
+        self.has_mesh = "meshes" in scene.terms
         if self.self_contact:
             if model.preconditioner == "jacobi":
                 raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
