@@ -217,16 +217,16 @@ def _halved(scene: Scene, start: State | None) -> Scene:
         before = np.concatenate([first[None], path[:-1]])
         path = np.stack([0.5 * (before + path), path], axis=1).reshape(-1, *path.shape[1:])
     forces = {node: np.repeat(f, 2, axis=0) if f.ndim == 2 else f for node, f in scene.forces.items()}
-    obstacles = [o if o.path is None else o.replace(path=_halved_poses(o)) for o in scene.obstacles]
+    obstacles = [o if o.path is None else o.replace(path=_halved_poses(o, o.path)) for o in scene.obstacles]
     return scene.replace(pin_path=path, forces=forces, obstacles=obstacles)
 
 
-def _halved_poses(obstacle: Obstacle) -> np.ndarray:
+def _halved_poses(obstacle: Obstacle, path: np.ndarray) -> np.ndarray:
     """Adds poses in the middle of an obstacle's steps."""
-    before = np.vstack([[*obstacle.position, *obstacle.rotation], obstacle.path[:-1]])
-    after = obstacle.path.copy()
+    before = np.vstack([[*obstacle.position, *obstacle.rotation], path[:-1]])
+    after = path.copy()
     # the shorter way round; halfway, the mean of two rotations is the one between
     after[:, 3:] *= np.where((before[:, 3:] * after[:, 3:]).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
     middle = 0.5 * (before + after)
     middle[:, 3:] /= np.linalg.norm(middle[:, 3:], axis=1, keepdims=True)
-    return np.stack([middle, obstacle.path], axis=1).reshape(-1, 7)
+    return np.stack([middle, path], axis=1).reshape(-1, 7)
