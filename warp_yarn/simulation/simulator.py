@@ -16,7 +16,6 @@ from ..device.model import Model
 from ..errors import choice, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
-from ..kernels.core.status import OVERLAPPING
 from ..moved import renamed_attribute
 from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
@@ -206,8 +205,7 @@ class Simulator(Inspection):
         """Says what happened after the last good frame, at which the state is."""
         failure = Failure(self.model)
         with np.errstate(all="ignore"):
-            forces = self.forces()
-        near = self.told_nearest(failure.node) if failure.code == OVERLAPPING else ""
+            forces, near = self.forces(), self.told_nearest(failure.node)
         raise failure.error(k, trajectory, forces, self.substepping, self.step_error, near)
 
     def run(self, steps: int, *, progress: bool | None = False) -> Trajectory:
