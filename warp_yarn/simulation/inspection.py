@@ -124,8 +124,8 @@ class Inspection:
 
     @alone
     def told_nearest(self, node: int) -> str:
-        """Tells what is nearest to a node of the present state, of what it may touch, with obstacles where the next step
-        has them, or ""."""
+        """Tells what is nearest to a node of the present state, with obstacles where the next step
+        has them; or ""."""
         contact = self.model.contact
         with _Visit(self.stepper, None, ahead=True):
             found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
