@@ -13,7 +13,9 @@ from warp_yarn.kernels.core.status import GAINED, STALLED
 
 import warp_yarn as wy
 from warp_yarn.calibration.problem import CalibrationProblem
-from warp_yarn.device import exclusive
+from warp_yarn.device import exclusive, graphs
+from warp_yarn.device.contact import Near
+from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
 from warp_yarn.view import render
 
@@ -60,6 +62,62 @@ def solve(simulator: wy.Simulator, force: np.ndarray) -> np.ndarray:
     with simulator.model.threads.at_hand():
         simulator.model.solve()
     return numbers(simulator, "solution")
+
+
+# -- contact ----------------------------------------------------------------------------------------------------------
+
+
+def upload(simulator: wy.Simulator, state: wy.State) -> None:
+    """Puts a simulator into a state, unchecked."""
+    simulator.stepper.frames.upload(state)
+
+
+def near_obstacles(simulator: wy.Simulator) -> Near:
+    """Every node and obstacle."""
+    return simulator.model.contact.near_obstacles()
+
+
+def near_faces(simulator: wy.Simulator) -> Near:
+    """Every node and face of a mesh that are near each other."""
+    return simulator.model.contact.near_faces()
+
+
+def near_room(simulator: wy.Simulator) -> int:
+    """Places of a node in the list of what is near."""
+    return int(simulator.arrays["near_room"])
+
+
+def obstacles_begin_a_step(simulator: wy.Simulator) -> None:
+    """Puts obstacles where they are at the first stage of the next step."""
+    simulator.model.contact.load(0)
+
+
+def power_of_obstacles(simulator: wy.Simulator) -> float:
+    """The power of their forces on the present state, where they were put last."""
+    simulator.arrays.zero("power")
+    simulator.model.contact.find()
+    simulator.model.contact.add_power()
+    return float(numbers(simulator, "power")[0])
+
+
+def launch_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has launches that would be captured made from Python, with loops there."""
+    monkeypatch.setattr(graphs.GraphCache, "run", lambda self, name, part: part())
+
+
+def look_after_stages(simulator: wy.Simulator, look: Callable[[bool], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calls a function at the end of every stage that was solved, with whether anything touches."""
+    launch_one_by_one(monkeypatch)
+    solve = Newton.solve
+
+    def looked_at(newton: Newton, stage: int) -> None:
+        solve(newton, stage)
+        if not numbers(simulator, "status")[0]:
+            touching = numbers(simulator, "touching")
+            look(bool(touching[0]))
+            put(simulator, "touching", touching)
+
+    monkeypatch.setattr(Newton, "solve", looked_at)
 
 
 # -- steps ------------------------------------------------------------------------------------------------------------

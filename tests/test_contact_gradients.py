@@ -133,12 +133,18 @@ def test_moving_obstacles(method: str) -> None:
     check_derivatives(wt.Rollout(push(), STEPS, integrator=method, **EXACT), names)
 
 
-@pytest.mark.parametrize("method", SLOWER)
-def test_self_contact(method: str) -> None:
+SOME = ("self_contact_stiffness", "self_contact_distance", "contact_friction", "velocity")
+ALL = (*SELF_LAW, "contact_stiffness", *STATE, *FABRIC)
+
+
+@pytest.mark.parametrize(
+    ("method", "names"), [("implicit-euler", SOME), *(pytest.param(m, ALL, marks=pytest.mark.slow) for m in METHODS)]
+)
+def test_self_contact(method: str, names: tuple[str, ...]) -> None:
     """Of a strip folded over itself, by the law and by all else, sliding and checkpoints included."""
     scene = wy.Scene(folded(), obstacles=[GROUND], self_contact=True)
     rollout = wt.Rollout(scene, STEPS, integrator=method, checkpoint_every=16, **EXACT)
-    check_derivatives(rollout, (*SELF_LAW, "contact_stiffness", *STATE, *FABRIC))
+    check_derivatives(rollout, names)
 
 
 @pytest.mark.slow

@@ -6,12 +6,18 @@ import itertools
 import numpy as np
 import pytest
 from cases import quick
-from internals import numbers
+from internals import (
+    look_after_stages,
+    near_faces,
+    near_obstacles,
+    numbers,
+    obstacles_begin_a_step,
+    power_of_obstacles,
+)
 from scipy.spatial.transform import Rotation
 from touching import GROUND, folded, gaps_of_pairs, lifted, paper, posed
 
 import warp_yarn as wy
-from warp_yarn.integrators.newton import Newton
 
 METHODS = ("implicit-euler", "sdirk2")
 ACROSS, UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -31,40 +37,18 @@ class Watch:
             for kind in ("contact", "self_contact")
         ]
 
-    def look(self) -> None:
-        contact = self.simulator.model.contact
-        if contact.obstacles:
-            self._add(contact.near_obstacles().gap, self.distances[0])
-        if contact.has_mesh:
-            self._add(contact.near_faces().gap, self.distances[0])
-        if contact.self_contact:
-            self._add(
-                gaps_of_pairs(self.simulator.scene.cloth, self.simulator, numbers(self.simulator, "position")),
-                self.distances[1],
-            )
+    def look(self, touches: bool = False) -> None:
+        self.touched += touches
+        if self.simulator.scene.obstacles:
+            self._add(near_obstacles(self.simulator).gap, self.distances[0])
+        if any(obstacle.shape == "mesh" for obstacle in self.simulator.scene.obstacles):
+            self._add(near_faces(self.simulator).gap, self.distances[0])
+        if self.simulator.scene.self_contact:
+            position = numbers(self.simulator, "position")
+            self._add(gaps_of_pairs(self.simulator.scene.cloth, self.simulator, position), self.distances[1])
 
     def _add(self, gap: np.ndarray, distance: float) -> None:
         self.least = min(self.least, float(gap.min(initial=np.inf)) / distance - 1.0)
-
-
-def watched(simulator: wy.Simulator, steps: int, monkeypatch: pytest.MonkeyPatch) -> Watch:
-    """Makes steps, launch by launch, and looks at the end of every stage."""
-    watch = Watch(simulator)
-    monkeypatch.setattr("warp_yarn.device.graphs.GraphCache.run", lambda self, name, part: part())
-    solve = Newton.solve
-
-    def looked_at(newton: Newton, stage: int) -> None:
-        solve(newton, stage)
-        if not numbers(simulator, "status")[0]:
-            touching = numbers(simulator, "touching")
-            watch.touched += int(touching[0])
-            watch.look()
-            simulator.arrays["touching"].assign(touching)
-
-    monkeypatch.setattr(Newton, "solve", looked_at)
-    simulator.run(steps)
-    watch.look()
-    return watch
 
 
 def crumpling(seed: int) -> tuple[wy.Scene, np.ndarray]:
@@ -139,14 +123,13 @@ def test_nothing_penetrates(run: tuple[str, str, int], monkeypatch: pytest.Monke
     state = simulator.state
     state.velocity[:] += velocity
     simulator.state = state
+    watch = Watch(simulator)
     if seed == 0:
-        watch = watched(simulator, steps, monkeypatch)
-        assert watch.touched > 5
-    else:
-        watch = Watch(simulator)
-        for _ in range(steps):
-            simulator.run(1)
-            watch.look()
+        look_after_stages(simulator, watch.look, monkeypatch)
+    for _ in range(steps):
+        simulator.run(1)
+        watch.look()
+    assert seed or watch.touched > 5
     assert watch.least > 0.0
 
 
@@ -318,22 +301,19 @@ def test_velocity_of_an_obstacle_is_the_difference_of_its_pose() -> None:
     state.velocity[:] = speed + np.cross(spin, state.position)
     simulator.state = state
     simulator.run(30)
-    simulator.model.contact.load(0)
+    obstacles_begin_a_step(simulator)
     position, spinning = numbers(simulator, "obstacle_position")[0], numbers(simulator, "obstacle_spin")[0]
     assert spinning == pytest.approx(spin, abs=1e-9)
     assert numbers(simulator, "obstacle_velocity")[0] == pytest.approx(speed, abs=1e-12)
     state = simulator.state
-    carried = numbers(simulator, "obstacle_velocity")[0] + np.cross(spinning, state.position - position)
+    carried = speed + np.cross(spin, state.position - position)
     assert np.abs(state.velocity - carried)[:, :2].max() < 5e-4
+    # which puts it where the last step left it
     found = simulator.contacts()
-    arm = state.position - numbers(simulator, "obstacle_position")[0]
-    carried = numbers(simulator, "obstacle_velocity")[0] + np.cross(spinning, arm)
     force = found.load[:, None] * found.normal + found.tangential
-    simulator.arrays.zero("power")
-    simulator.model.contact.find()
-    simulator.model.contact.add_power()
-    expected = (force * carried[found.node]).sum()
-    assert numbers(simulator, "power")[0] == pytest.approx(expected, rel=1e-9, abs=1e-18)
+    place = numbers(simulator, "obstacle_position")[0]
+    expected = (force * (speed + np.cross(spin, state.position - place))[found.node]).sum()
+    assert power_of_obstacles(simulator) == pytest.approx(expected, rel=1e-9, abs=1e-18)
 
 
 def test_nothing_of_contact_without_contact() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from internals import numbers
 from reference import Tensor, tensor
 from scipy.spatial.transform import Rotation
 
@@ -52,8 +53,7 @@ def folded(
 
 def far_apart(cloth: wy.Cloth, simulator: wy.Simulator) -> np.ndarray:
     """Which nodes are so far apart along the cloth that they may touch [nodes, nodes]."""
-    a = simulator.arrays
-    touch = a["self_contact_distance"].numpy()[0] + a["self_contact_range"].numpy()[0]
+    touch = sum(float(numbers(simulator, f"self_contact_{name}")[0]) for name in ("distance", "range"))
     rest = np.linalg.norm(cloth.rest_place[:, None] - cloth.rest_place[None], axis=2)
     return rest >= 0.5 * np.pi * touch
 
@@ -191,7 +191,7 @@ class Law:
 
 def law_of(simulator: wy.Simulator, friction: float, kind: str = "contact") -> Law:
     names = ("stiffness", "distance", "range", "slip_speed", "damping_speed")
-    return Law(*(float(simulator.arrays[f"{kind}_{name}"].numpy()[0]) for name in names), friction)
+    return Law(*(float(numbers(simulator, f"{kind}_{name}")[0]) for name in names), friction)
 
 
 def places_near(distance: Callable[[Tensor], Tensor], count: int, low: float, high: float, seed: int = 0) -> np.ndarray:

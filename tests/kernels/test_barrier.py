@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from checks import check_definite, error
+from internals import near_faces, near_obstacles, upload
 from reference import tensor
 from touching import SHAPES, TURNED, gradient, law_of, paper, parts_of, places_near, posed, shapes
 
@@ -61,8 +62,8 @@ def test_distance_and_normal(shape: str) -> None:
         places = places_near(distance, CLOTH.nodes, low, high)
         gap, n = gradient(distance, places)
         simulator.forces(posed(CLOTH, places))
-        simulator.stepper.frames.upload(posed(CLOTH, places))
-        near = simulator.model.contact.near_obstacles()
+        upload(simulator, posed(CLOTH, places))
+        near = near_obstacles(simulator)
         # of places 1e-2 m away; an edge's normal is over the gap
         assert np.abs(near.gap - gap.numpy()).max() < 1e-16
         assert np.abs(near.normal - n.numpy()).max() < 1e-16 / low * 10.0
@@ -83,8 +84,8 @@ def test_faces_that_are_near() -> None:
     simulator = scene_on("mesh")
     law = law_of(simulator, 0.3)
     places = places_near(shapes()["mesh"][1], CLOTH.nodes, 1e-5, 1.5e-3)
-    simulator.stepper.frames.upload(posed(CLOTH, places))
-    near = simulator.model.contact.near_faces()
+    upload(simulator, posed(CLOTH, places))
+    near = near_faces(simulator)
     parts = [gradient(distance, places) for distance in parts_of("mesh")]
     gap, n = np.array([gap.numpy() for gap, _ in parts]).T, np.array([n.numpy() for _, n in parts]).swapaxes(0, 1)
     touch = law.distance + law.range

@@ -52,8 +52,9 @@ class Failure:
         if node >= 0:
             where += f" at node {node} ({model.scene.cloth.place(node)})"
         smallest = substepping.last_size * model.step_size
+        near = f" (before the step, {near})" if near else ""
         what = {
-            status.NOT_FINITE: "a value is not finite",
+            status.NOT_FINITE: f"a value is not finite{near}",
             status.ORDER_LOST: "Δs to the next crossing of the yarn reached 0",
             status.NOT_CONVERGED: (
                 f"the solver stopped after {self.iterations} iterations at a residual of {self.residual:.1e}, "
@@ -64,8 +65,7 @@ class Failure:
                 f"above its tolerance of {model.newton_tolerance_at(smallest):.1e}"
             ),
             status.GAINED: "the cloth gains energy that nothing gave it: take a shorter step or another integrator",
-            status.OVERLAPPING: "it is pressed into something that leaves it no way out"
-            + (f" (before the step, {near})" if near else ""),
+            status.OVERLAPPING: f"it is pressed into something that leaves it no way out{near}",
             status.CROWDED: "more of it comes together than there is room for",
             status.IMPACT: "something strikes it",
             status.INACCURATE: f"its error stays above step_error = {step_error}: allow more",

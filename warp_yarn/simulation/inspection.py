@@ -10,11 +10,10 @@ import numpy as np
 from ..device.contact import Near
 from ..device.model import Model
 from ..errors import InputError
-from ..kernels.core.status import CROWDED, OVERLAPPING
+from ..kernels.core.status import CROWDED
 from .alone import alone
 from .checks import checked_state
 from .contacts import Contacts, contacts_of
-from .diagnosis import Failure
 from .linear_system import LinearSystem, read_system
 from .state import FIELDS, State
 from .stepper import Stepper
@@ -124,11 +123,10 @@ class Inspection:
                     raise InputError(words)
 
     @alone
-    def told_nearest(self, failure: Failure) -> str:
-        """Tells what is nearest to a node of the present state that is pressed into something, or ""."""
-        if failure.code != OVERLAPPING:
-            return ""
-        contact, node = self.model.contact, failure.node
+    def told_nearest(self, node: int) -> str:
+        """Tells what is nearest to a node of the present state, with obstacles where the next step
+        has them; or ""."""
+        contact = self.model.contact
         with _Visit(self.stepper, None, ahead=True):
             found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             found += [contact.near_obstacles()] if contact.obstacles else []

@@ -205,8 +205,8 @@ class Simulator(Inspection):
         """Says what happened after the last good frame, at which the state is."""
         failure = Failure(self.model)
         with np.errstate(all="ignore"):
-            forces = self.forces()
-        raise failure.error(k, trajectory, forces, self.substepping, self.step_error, self.told_nearest(failure))
+            forces, near = self.forces(), self.told_nearest(failure.node)
+        raise failure.error(k, trajectory, forces, self.substepping, self.step_error, near)
 
     def run(self, steps: int, *, progress: bool | None = False) -> Trajectory:
         """Makes steps and returns every frame, the present one first.
