@@ -158,16 +158,12 @@ TESTS = {file.relative_to(ROOT / "tests").as_posix(): file for file in sorted((R
 KNOW_THE_INSIDE = {
     "internals.py",
     # these look at arrays and launches themselves, which no public call gives
-    "kernels/test_barrier.py",
     "kernels/test_contact.py",
     "kernels/test_declarations.py",
     "kernels/test_friction.py",
     "kernels/test_inertia.py",
     "kernels/test_multilevel.py",
     "kernels/test_reference_forces.py",
-    "kernels/test_self_contact.py",
-    "test_contact_motion.py",
-    "touching.py",
 }
 """Files that reach into the package; the others do by the functions of tests/internals.py."""
 
