@@ -1,4 +1,5 @@
-"""What a model's cloth touches: arrays of obstacles and of the law, and the host's side of ``kernels/contact``."""
+"""What a model's cloth touches by a barrier: arrays of obstacles and of the law, and the host's side of
+``kernels/contact``. (``impact_zones.py`` has the other method.)"""
 
 from __future__ import annotations
 
@@ -61,10 +62,10 @@ def _steps(scene: Scene) -> int:
 def set_arrays(arrays: Arrays) -> None:
     """Fill the arrays of a scene's contact."""
     scene, cloth, contact = arrays.scene, arrays.scene.cloth, arrays.scene.contact
-    if scene.obstacles:
+    if "obstacles" in arrays.conditions:
         _set_law(arrays, "contact", contact.distance or cloth.radius, contact.range or cloth.radius)
         _set_obstacles(arrays, scene)
-    if scene.self_contact:
+    if "self-contact" in arrays.conditions:
         distance = contact.self_distance or max(1.5 * cloth.spacing, 3.0 * cloth.radius)
         reach = contact.self_range or cloth.spacing
         _set_law(arrays, "self_contact", distance, reach)
@@ -128,7 +129,7 @@ def _quaternions(arrays: Arrays, values: np.ndarray) -> wp.array:
 
 
 class Contact:
-    """The contact of a model's cloth with obstacles and with itself.
+    """The contact of a model's cloth with obstacles and with itself, by a barrier.
 
     Attributes:
         on: whether the scene has any.
@@ -137,11 +138,12 @@ class Contact:
 
     def __init__(self, model: Model):
         self.model, scene = model, model.scene
-        self.obstacles, self.self_contact = bool(scene.obstacles), scene.self_contact
+        conditions = model.arrays.conditions
+        self.obstacles, self.self_contact = "obstacles" in conditions, "self-contact" in conditions
         self.on = self.obstacles or self.self_contact
-        self.obstacles_move = "obstacles move" in model.arrays.conditions
+        self.obstacles_move = "obstacles move" in conditions
         self._tapes: dict[int, wp.Tape] = {}
-        self._has_mesh = any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
+        self._has_mesh = self.obstacles and any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
         if self.self_contact:
             a, cloth = model.arrays, scene.cloth
             self._reach = float(a["self_contact_distance"].numpy()[0] + a["self_contact_range"].numpy()[0])

@@ -20,6 +20,7 @@ from .arrays import Arrays
 from .contact import Contact
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
+from .impact_zones import ImpactZones
 from .inputs import Inputs
 from .threads import Threads
 
@@ -44,7 +45,8 @@ class Model:
         arrays: by the names that kernels use.
         kernels: by name.
         inputs: those that change from step to step.
-        contact: what the cloth touches.
+        contact: what the cloth touches by a barrier.
+        zones: keep it apart otherwise; None: there are none.
         energy: the watch over it.
         threads: processor cores that share a linear solve.
         has_hard_pins: whether pins are exact.
@@ -95,6 +97,7 @@ class Model:
         self.set_times(self.step_size, self.step_size, self.step_size)
         self.inputs = Inputs(self)
         self.contact = Contact(self)
+        self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()

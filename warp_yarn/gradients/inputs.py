@@ -127,7 +127,7 @@ class Inputs:
 def obstacle_shapes(simulator: Simulator) -> dict[str, tuple[int, ...]]:
     """Lists the inputs that say where obstacles are and what they are like, with their shapes."""
     count = len(simulator.scene.obstacles)
-    if not count:
+    if not simulator.model.contact.obstacles:
         return {}
     shapes: dict[str, tuple[int, ...]] = {"obstacle_size": (count, 3), "obstacle_friction": (count,)}
     rest = (-1, count) if simulator.model.contact.obstacles_move else (count,)

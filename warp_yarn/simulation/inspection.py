@@ -77,7 +77,13 @@ class Inspection:
 
     @alone
     def contacts(self, state: State | None = None) -> Contacts:
-        """Finds where nodes touch obstacles and each other (None: in the present state)."""
+        """Finds where nodes touch obstacles and each other (None: in the present state).
+
+        Raises:
+            InputError: impact zones keep them apart, which have no forces.
+        """
+        if self.model.zones is not None:
+            raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
         contact, found = self.model.contact, []
         with _Visit(self.stepper, state):
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
@@ -102,6 +108,8 @@ class Inspection:
         Raises:
             InputError: the two places that are nearest, and how near.
         """
+        if self.model.zones is not None:
+            self.model.zones.check_clear(None if state is None else state.position)
         contact, place = self.model.contact, self.model.scene.cloth.place
         with _Visit(self.stepper, state):
             found = [self._near_pairs()] if contact.self_contact else []

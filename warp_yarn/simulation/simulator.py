@@ -127,7 +127,7 @@ class Simulator(Inspection):
             self.chunk = self.stepper.frames.chunk
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
-        if self.model.contact.on:
+        if self.model.contact.on or self.model.zones is not None:
             self.check_clear()
         warn_of_threads(threads)
 
@@ -157,7 +157,7 @@ class Simulator(Inspection):
     @alone
     def state(self, state: State) -> None:
         state = checked_state(state, self.scene)
-        if self.model.contact.on:
+        if self.model.contact.on or self.model.zones is not None:
             self.check_clear(state)
         self.stepper.begin_from(state)
 
