@@ -3,9 +3,9 @@
 A vertex meets a face, or an edge an edge, where their four points lie in a plane: a cubic equation in the time t of the
 step, from 0 to 1. Its roots are looked at in their order, and the first where the vertex is within the face, or the
 edges cross, is an impact, with the normal n of face or edges then and the weights w of the two places that meet; n
-points to the side that the first of them came from. What does not meet but ends nearer than ``near`` is an impact too,
-with the normal and weights of the places that are closest at the end: else what lies on something would fall on it
-anew in every step.
+points to the side that the first of them came from. What does not meet but ends nearer than ``near``, a vertex above
+the inside of a face or the insides of two edges, is an impact too, with the normal and weights that it has at the end:
+else what lies on something would fall on it anew in every step.
 
 Vertices, edges and faces are those of the cloth, first, and of obstacles. Boxes of the bounding volume hierarchy are in
 single precision, rounded outwards; all else is in double, whatever the scene's precision.
@@ -20,6 +20,9 @@ ROOM = 1e-6
 """How far beyond its rim a face is met, in barycentric coordinates: roots have an error."""
 PARALLEL = 1e-10
 """Squared sine between edges that have no normal."""
+ASKEW = 1e-2
+"""Squared sine above which what lies between edges tells a normal: between edges that are almost parallel, and have not
+met, it would push along them."""
 NONE = 2.0
 """In place of a root that is not there."""
 
@@ -115,38 +118,6 @@ def functions() -> SimpleNamespace:
         return vec4(w, u, v, inside)
 
     @wp.func
-    def closest_on_face(x: vec3, a: vec3, b: vec3, c: vec3) -> vec3:
-        """Find the weights of the point of a triangle that is closest (Ericson, Real-Time Collision Detection, 5.1)."""
-        zero, one = wp.float64(0.0), wp.float64(1.0)
-        ab = b - a
-        ac = c - a
-        d1 = wp.dot(ab, x - a)
-        d2 = wp.dot(ac, x - a)
-        if d1 <= zero and d2 <= zero:
-            return vec3(one, zero, zero)
-        d3 = wp.dot(ab, x - b)
-        d4 = wp.dot(ac, x - b)
-        if d3 >= zero and d4 <= d3:
-            return vec3(zero, one, zero)
-        vc = d1 * d4 - d3 * d2
-        if vc <= zero and d1 >= zero and d3 <= zero:
-            t = d1 / (d1 - d3)
-            return vec3(one - t, t, zero)
-        d5 = wp.dot(ab, x - c)
-        d6 = wp.dot(ac, x - c)
-        if d6 >= zero and d5 <= d6:
-            return vec3(zero, zero, one)
-        vb = d5 * d2 - d1 * d6
-        if vb <= zero and d2 >= zero and d6 <= zero:
-            t = d2 / (d2 - d6)
-            return vec3(one - t, zero, t)
-        va = d3 * d6 - d5 * d4
-        if va <= zero and d4 - d3 >= zero and d5 - d6 >= zero:
-            t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-            return vec3(zero, one - t, t)
-        return vec3(va, vb, vc) / (va + vb + vc)
-
-    @wp.func
     def crossing_edges(a: vec3, b: vec3, c: vec3, d: vec3) -> vec3:
         """Find the parameters s, t of the points a + s (b − a) and c + t (d − c) of two lines that are closest, and
         whether both are within the edges."""
@@ -168,11 +139,16 @@ def functions() -> SimpleNamespace:
         inside = s >= -room and s <= one + room and t >= -room and t <= one + room
         return vec3(s, t, wp.where(inside, one, zero))
 
+    @wp.func
+    def square_of_sine(a: vec3, b: vec3) -> wp.float64:
+        n = wp.cross(a, b)
+        return wp.dot(n, n) / (wp.dot(a, a) * wp.dot(b, b))
+
     return SimpleNamespace(
+        square_of_sine=square_of_sine,
         cubic_roots=cubic_roots,
         coplanar=coplanar,
         within_face=within_face,
-        closest_on_face=closest_on_face,
         crossing_edges=crossing_edges,
     )
 
@@ -181,8 +157,8 @@ def functions() -> SimpleNamespace:
 def define() -> SimpleNamespace:
     vec3, vec4 = wp.vec3d, wp.vec4d
     parts = functions()
-    cubic_roots, coplanar = parts.cubic_roots, parts.coplanar
-    within_face, closest_on_face, crossing_edges = parts.within_face, parts.closest_on_face, parts.crossing_edges
+    cubic_roots, coplanar, square_of_sine = parts.cubic_roots, parts.coplanar, parts.square_of_sine
+    within_face, crossing_edges = parts.within_face, parts.crossing_edges
     module = "warp_yarn_continuous"
 
     @wp.struct
@@ -269,12 +245,12 @@ def define() -> SimpleNamespace:
         weights = vec4()
         if of_edges != 0:
             st = crossing_edges(vec3(), a + va, b + vb, c + vc)
-            # on its rim an edge is left to the vertices there
-            if st[2] > zero:
+            if st[2] > zero and square_of_sine(a + va, c + vc - b - vb) > wp.float64(wp.static(ASKEW)):
                 weights = vec4(one - st[0], st[0], st[1] - one, -st[1])
         else:
-            foot = closest_on_face(vec3(), a + va, b + vb, c + vc)
-            weights = vec4(one, -foot[0], -foot[1], -foot[2])
+            foot = within_face(vec3(), a + va, b + vb, c + vc)
+            if foot[3] > zero:
+                weights = vec4(one, -foot[0], -foot[1], -foot[2])
         if weights[0] != zero or weights[1] != zero:
             apart = pulled(surface, vertices, weights, one)
             distance = wp.length(apart)

@@ -83,22 +83,40 @@ class Detection:
             faces.append(triangles + first)
             first += len(vertices)
         self._room = ROOM
-        self._kernels = continuous.define()
+        self._kernels = vars(continuous.define())
         self._looks = bool(solid) or scene.self_contact
         self._set_surface(np.concatenate(faces).astype(np.int32), len(faces[0]), scene.self_contact)
 
     def _set_surface(self, faces: np.ndarray, of_cloth: int, touches_itself: bool) -> None:
         pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, first = np.unique(pairs, axis=0, return_index=True)
+        edges, first, inverse = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
         owned = np.full(len(pairs), -1, dtype=np.int32)
         owned[first] = np.arange(len(edges), dtype=np.int32)
+        owned[first[self._flat(faces, edges, inverse.ravel())]] = -1
         self.faces, self.edges = faces, edges.astype(np.int32)
-        surface = self._kernels.Surface()
+        surface = self._kernels["Surface"]()
         surface.nodes, surface.triangles, surface.touches_itself = self.nodes, of_cloth, int(touches_itself)
         surface.faces = wp.array(faces, dtype=wp.vec3i, device=self.device)
         surface.edges = wp.array(self.edges, dtype=wp.vec2i, device=self.device)
         surface.owned = wp.array(owned.reshape(-1, 3), dtype=wp.vec3i, device=self.device)
         self._surface = surface
+
+    def _flat(self, faces: np.ndarray, edges: np.ndarray, edge: np.ndarray) -> np.ndarray:
+        """Tell which edges of obstacles lie within a flat face, between two triangles of it [edges]: a node over one is
+        over a triangle.
+
+        Args:
+            faces, edges: all of them.
+            edge: of each side of each face.
+        """
+        corner = self.places(np.zeros((self.nodes, 3)))[faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+        # of the two sides of an edge, the same normal or the opposite one
+        spread = np.zeros((len(edges), 3, 3))
+        np.add.at(spread, edge, np.repeat(normal[:, :, None] * normal[:, None], 3, axis=0))
+        largest = np.linalg.eigvalsh(spread)[:, -1]
+        return (edges[:, 0] >= self.nodes) & (np.bincount(edge) == 2) & (largest > 2.0 - 1e-9)
 
     def places(self, position: np.ndarray) -> np.ndarray:
         """Append the vertices of obstacles to those of the cloth."""
@@ -109,8 +127,9 @@ class Detection:
         [m]."""
         found = self._behind_planes(end, near)
         if self._looks:
-            kernels = [self._kernels.find_vertices, self._kernels.find_edges]
-            found = found.and_these(self._search(kernels, self.places(start), self.places(end), near, near))
+            found = found.and_these(
+                self._search(["vertices", "edges"], self.places(start), self.places(end), near, near)
+            )
         return found
 
     def crossings(self, position: np.ndarray) -> np.ndarray:
@@ -118,7 +137,7 @@ class Detection:
         if not self._looks:
             return none().vertices
         places = self.places(position)
-        return self._search([self._kernels.find_crossings], places, places, 0.0).vertices
+        return self._search(["crossings"], places, places, 0.0).vertices
 
     def _behind_planes(self, position: np.ndarray, near: float) -> Found:
         points = self.fixed[self.first_plane - self.nodes :]
@@ -127,23 +146,20 @@ class Detection:
         vertices = np.column_stack([node, *[self.first_plane + plane] * 3]) if len(node) else none().vertices
         return Found(vertices, np.tile([1.0, -1.0, 0.0, 0.0], (len(node), 1)), self.normals[plane])
 
-    def _search(self, kernels: list[Any], start: np.ndarray, end: np.ndarray, reach: float, *near: float) -> Found:
-        """Launch kernels over the hierarchy of all faces, and again where there was no room for all impacts."""
+    def _search(self, names: list[str], start: np.ndarray, end: np.ndarray, reach: float, *near: float) -> Found:
+        """Launch kernels, by name, over the hierarchy of faces, and again where there was no room for all impacts."""
         low, high = np.minimum(start, end), np.maximum(start, end)
         with ALONE:
             self._surface.start = wp.array(start, dtype=wp.vec3d, device=self.device)
             self._surface.end = wp.array(end, dtype=wp.vec3d, device=self.device)
             tree = wp.Bvh(*self._boxes(low[self.faces].min(axis=1) - reach, high[self.faces].max(axis=1) + reach))
-            boxes = {
-                "find_vertices": self._boxes(low, high),
-                "find_edges": self._boxes(low[self.edges].min(axis=1), high[self.edges].max(axis=1)),
-            }
-            boxes["find_crossings"] = boxes["find_edges"]
+            of_edges = self._boxes(low[self.edges].min(axis=1), high[self.edges].max(axis=1))
+            boxes = {"vertices": self._boxes(low, high), "edges": of_edges, "crossings": of_edges}
             while True:
                 impacts = self._new_impacts()
-                for kernel in kernels:
-                    arguments = [tree.id, self._surface, *boxes[kernel.key], *near, impacts]
-                    wp.launch(kernel, len(boxes[kernel.key][0]), arguments, device=self.device)
+                for name in names:
+                    arguments = [tree.id, self._surface, *boxes[name], *near, impacts]
+                    wp.launch(self._kernels[f"find_{name}"], len(boxes[name][0]), arguments, device=self.device)
                 count = int(impacts.count.numpy()[0])
                 if count <= self._room:
                     break
@@ -153,7 +169,7 @@ class Detection:
         return found[np.lexsort(found.vertices.T)]
 
     def _new_impacts(self) -> Any:
-        impacts = self._kernels.Impacts()
+        impacts = self._kernels["Impacts"]()
         impacts.count = wp.zeros(1, dtype=int, device=self.device)
         for name, dtype in (("vertices", wp.vec4i), ("weights", wp.vec4d), ("normals", wp.vec3d)):
             setattr(impacts, name, wp.empty(self._room, dtype=dtype, device=self.device))
