@@ -27,7 +27,7 @@ import numpy as np
 from ..description.obstacles import Box
 from ..errors import InputError
 from ..kernels.core.status import OVERLAPPING, UNRESOLVED
-from .impacts import Detection, Found, none, turned
+from .impacts import Found, detection_of, none, turned
 from .projection import Constraints, NoWayOut, Zone, project, transposed
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class ImpactZones:
     def __init__(self, model: Model):
         self.model, scene = model, model.scene
         self.thickness: float = scene.contact.thickness or THICKNESS * scene.cloth.spacing
-        self.detection = Detection(scene, model.device)
+        self.detection, self._obstacle = detection_of(scene, model.device)
         self.made: dict[int, Projected] = {}
         self.rounds = 0
         a, topology = model.arrays, scene.cloth.topology
@@ -119,7 +119,7 @@ class ImpactZones:
         near = self.thickness
         for self.rounds in range(MOST_ROUNDS):
             more = self.detection.find(start, position, near)
-            more = more[more.gap(self.detection.places(position)) < (1.0 - EXACT) * self.thickness]
+            more = more.pick(more.gap(self.detection.places(position)) < (1.0 - EXACT) * self.thickness)
             if not len(more.weights):
                 return position, zones
             found = found.and_these(more)
@@ -218,7 +218,7 @@ class ImpactZones:
         name = f"node {node} ({cloth.place(node)})"
         others = [int(k) - nodes for k in vertices if k >= nodes]
         if others:
-            obstacle = int(self.detection.obstacle[others[0]])
+            obstacle = int(self._obstacle[others[0]])
             return f"{name} and obstacles[{obstacle}], a {type(self.model.scene.obstacles[obstacle]).__name__}"
         other = int(vertices[-1])
         return f"{name} and node {other} ({cloth.place(other)})"

@@ -5,7 +5,8 @@ Planes are no triangles: what is behind one at the end of a step is its impact, 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -22,29 +23,35 @@ SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2,
 """Of a box: which of its corners."""
 
 
-class Found(NamedTuple):
+NO_POINTS, NO_FACES = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
     """Impacts: n·Σ w x is how far the first of two places is from the second, on the side that it belongs.
 
-    Vertices from ``nodes`` on are those of obstacles.
+    Args:
+        vertices: four of each, from ``nodes`` on those of obstacles [impacts, 4].
+        weights: w [impacts, 4].
+        normals: n [impacts, 3].
     """
 
     vertices: np.ndarray
-    """[impacts, 4]"""
     weights: np.ndarray
-    """[impacts, 4]"""
     normals: np.ndarray
-    """[impacts, 3]"""
 
     def gap(self, places: np.ndarray) -> np.ndarray:
         """Compute n·Σ w x of all vertices' places [impacts] (m)."""
         return np.einsum("ki,kij,kj->k", self.weights, places[self.vertices], self.normals)
 
-    def __getitem__(self, rows: Any) -> Found:  # type: ignore[override]
-        return Found(*(values[rows] for values in (self.vertices, self.weights, self.normals)))
+    def pick(self, rows: np.ndarray) -> Found:
+        """Take some of them."""
+        return Found(self.vertices[rows], self.weights[rows], self.normals[rows])
 
     def and_these(self, others: Found) -> Found:
         """Join with others."""
-        return Found(*(np.concatenate(pair) for pair in zip(tuple(self), tuple(others), strict=True)))
+        names = ("vertices", "weights", "normals")
+        return Found(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in names))
 
 
 def none() -> Found:
@@ -53,39 +60,39 @@ def none() -> Found:
 
 
 class Detection:
-    """Finds impacts of a scene's cloth.
+    """Finds impacts of cloth.
 
     Args:
-        scene: the scene; its obstacles are planes, boxes and triangle meshes that stand still.
+        nodes: of the cloth.
+        faces: of the cloth [faces, 3].
+        fixed: where other vertices stand still [vertices, 3] (m), counted on from the nodes.
+        fixed_faces: of these [faces, 3].
+        planes: points [planes, 3] (m) and normals [planes, 3] of planes.
+        touches_itself: whether the cloth may.
         device: of Warp.
 
     Attributes:
-        nodes: of the cloth.
-        obstacle: of every vertex of an obstacle, and of every plane behind them, the obstacle.
-        fixed: where the vertices of obstacles are [vertices, 3] (m).
+        fixed: the points of planes are the last of them.
     """
 
-    def __init__(self, scene: Scene, device: Any):
-        self.device, self.nodes = device, scene.cloth.nodes
-        several = list(enumerate(scene.obstacles))
-        solid = [(k, *triangles_of(obstacle)) for k, obstacle in several if not isinstance(obstacle, Plane)]
-        planes = [(k, obstacle) for k, obstacle in several if isinstance(obstacle, Plane)]
-        up = np.array([[0.0, 0.0, 1.0]])
-        self.normals = np.concatenate([np.zeros((0, 3)), *(turned(obstacle.rotation, up) for _, obstacle in planes)])
-        points = np.array([obstacle.position for _, obstacle in planes]).reshape(-1, 3)
-        self.fixed: np.ndarray = np.concatenate([*(vertices for _, vertices, _ in solid), points])
-        self.obstacle = np.repeat(
-            [*(k for k, _, _ in solid), *(k for k, _ in planes)], [*(len(v) for _, v, _ in solid), *(1 for _ in planes)]
-        ).astype(int)
-        self.first_plane = self.nodes + len(self.fixed) - len(planes)
-        faces, first = [scene.cloth.topology.triangle_nodes], self.nodes
-        for _, vertices, triangles in solid:
-            faces.append(triangles + first)
-            first += len(vertices)
+    def __init__(
+        self,
+        nodes: int,
+        faces: np.ndarray,
+        *,
+        fixed: np.ndarray = NO_POINTS,
+        fixed_faces: np.ndarray = NO_FACES,
+        planes: tuple[np.ndarray, np.ndarray] = (NO_POINTS, NO_POINTS),
+        touches_itself: bool = False,
+        device: Any = "cpu",
+    ):
+        self.device, self.nodes = device, nodes
+        self.fixed: np.ndarray = np.concatenate([fixed, planes[0]])
+        self._first_plane, self._normals = nodes + len(fixed), planes[1]
         self._room = ROOM
         self._kernels = vars(continuous.define())
-        self._looks = bool(solid) or scene.self_contact
-        self._set_surface(np.concatenate(faces).astype(np.int32), len(faces[0]), scene.self_contact)
+        self._looks = len(fixed_faces) > 0 or touches_itself
+        self._set_surface(np.concatenate([faces, fixed_faces]).astype(np.int32), len(faces), touches_itself)
 
     def _set_surface(self, faces: np.ndarray, of_cloth: int, touches_itself: bool) -> None:
         pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -140,11 +147,11 @@ class Detection:
         return self._search(["crossings"], places, places, 0.0).vertices
 
     def _behind_planes(self, position: np.ndarray, near: float) -> Found:
-        points = self.fixed[self.first_plane - self.nodes :]
-        gap = np.einsum("ipj,pj->ip", position[:, None] - points[None], self.normals)
+        points = self.fixed[self._first_plane - self.nodes :]
+        gap = np.einsum("ipj,pj->ip", position[:, None] - points[None], self._normals)
         node, plane = np.nonzero(gap < near)
-        vertices = np.column_stack([node, *[self.first_plane + plane] * 3]) if len(node) else none().vertices
-        return Found(vertices, np.tile([1.0, -1.0, 0.0, 0.0], (len(node), 1)), self.normals[plane])
+        vertices = np.column_stack([node, *[self._first_plane + plane] * 3]) if len(node) else none().vertices
+        return Found(vertices, np.tile([1.0, -1.0, 0.0, 0.0], (len(node), 1)), self._normals[plane])
 
     def _search(self, names: list[str], start: np.ndarray, end: np.ndarray, reach: float, *near: float) -> Found:
         """Launch kernels, by name, over the hierarchy of faces, and again where there was no room for all impacts."""
@@ -166,7 +173,7 @@ class Detection:
                 self._room = 2 * count
             found = Found(*(getattr(impacts, name).numpy()[:count] for name in ("vertices", "weights", "normals")))
         # a GPU finds them in any order
-        return found[np.lexsort(found.vertices.T)]
+        return found.pick(np.lexsort(found.vertices.T))
 
     def _new_impacts(self) -> Any:
         impacts = self._kernels["Impacts"]()
@@ -180,6 +187,36 @@ class Detection:
         infinite = np.float32(np.inf)
         rounded = np.nextafter(lower.astype(np.float32), -infinite), np.nextafter(upper.astype(np.float32), infinite)
         return tuple(wp.array(values, dtype=wp.vec3, device=self.device) for values in rounded)  # type: ignore
+
+
+def detection_of(scene: Scene, device: Any) -> tuple[Detection, np.ndarray]:
+    """Make what finds impacts of a scene's cloth with planes, boxes and triangle meshes that stand still, and with
+    itself.
+
+    Returns:
+        It, and of each of its fixed vertices the obstacle.
+    """
+    several, cloth = list(enumerate(scene.obstacles)), scene.cloth
+    solid = [(k, *triangles_of(obstacle)) for k, obstacle in several if not isinstance(obstacle, Plane)]
+    planes = [(k, obstacle) for k, obstacle in several if isinstance(obstacle, Plane)]
+    up, first, faces = np.array([[0.0, 0.0, 1.0]]), cloth.nodes, [NO_FACES]
+    for _, vertices, triangles in solid:
+        faces.append(triangles + first)
+        first += len(vertices)
+    detection = Detection(
+        cloth.nodes,
+        cloth.topology.triangle_nodes,
+        fixed=np.concatenate([NO_POINTS, *(vertices for _, vertices, _ in solid)]),
+        fixed_faces=np.concatenate(faces),
+        planes=(
+            np.concatenate([NO_POINTS, *(obstacle.position[None] for _, obstacle in planes)]),
+            np.concatenate([NO_POINTS, *(turned(obstacle.rotation, up) for _, obstacle in planes)]),
+        ),
+        touches_itself=scene.self_contact,
+        device=device,
+    )
+    counts = [len(vertices) for _, vertices, _ in solid] + [1] * len(planes)
+    return detection, np.repeat([k for k, *_ in solid] + [k for k, _ in planes], counts).astype(int)
 
 
 def triangles_of(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray]:
