@@ -108,7 +108,8 @@ def meets(start: np.ndarray, end: np.ndarray, of_edges: bool) -> bool | None:
             u, v = np.linalg.lstsq(basis, p[0] - p[1], rcond=None)[0]
             normal = np.cross(p[2] - p[1], p[3] - p[1])
             weights, within = np.array([1.0, u + v - 1.0, -u, -v]), np.array([1.0 - u - v, u, v])
-        if abs(within.min()) < 1e-3:
+        along = abs(normal @ (weights @ start)) / (np.linalg.norm(normal) * np.linalg.norm(weights @ start))
+        if abs(within.min()) < 1e-3 or along < 2e-3:
             return None
         before, after = normal @ (weights @ start), normal @ (weights @ end)
         if within.min() > 0.0 and before * after < 0.0:
@@ -530,7 +531,8 @@ def compare(scene: wy.Scene, steps: int, names: tuple[str, ...], bound: float, *
                 ends = [loss({**given, name: given[name] + s * direction}) for s in (e, -e)]
             return float(ends[0] - ends[1]) / (2.0 * e)
 
-        wanted = (4.0 * difference(5e-3) - difference(1e-2)) / 3.0
+        # beyond 1e-2 yarns buckle within the difference
+        wanted = (4.0 * difference(1e-3) - difference(2e-3)) / 3.0
         assert float((leaves[name].grad * direction).sum()) == pytest.approx(wanted, rel=bound), name
     return rollout
 
@@ -546,4 +548,4 @@ GROUNDS = {
 def test_gradients_through_impacts(ground, every):
     """On planes and flat faces normals do not turn: nothing is left out."""
     scene = wy.Scene(cloth(friction_damping=0.1), obstacles=[GROUNDS[ground]], contact=ZONES)
-    compare(scene, 12, ("position", "velocity", "gravity", "yarn_density"), 1e-5, checkpoint_every=every)
+    compare(scene, 12, ("position", "velocity", "gravity", "yarn_density"), 1e-6, checkpoint_every=every)

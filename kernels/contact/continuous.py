@@ -21,8 +21,11 @@ ROOM = 1e-6
 PARALLEL = 1e-10
 """Squared sine between edges that have no normal."""
 ASKEW = 1e-2
-"""Squared sine above which what lies between edges tells a normal: between edges that are almost parallel, and have not
-met, it would push along them."""
+"""Squared sine up to which the normal of two edges may point anywhere across them: those that meet take the way that
+they came instead, and what is merely near is left to their ends."""
+ALONG = 1e-3
+"""Of the way that two places came: what of it is along the normal. With less they moved in one plane, as edges do that
+lie above each other, whose ends meet instead; steps leave at least half the thickness between what slides."""
 NONE = 2.0
 """In place of a root that is not there."""
 
@@ -230,16 +233,20 @@ def define() -> SimpleNamespace:
                     if st[2] > zero:
                         weights = vec4(one - st[0], st[0], st[1] - one, -st[1])
                         normal = wp.normalize(wp.cross(pa, pc - pb))
+                        if square_of_sine(pa, pc - pb) <= wp.float64(wp.static(ASKEW)):
+                            normal = wp.normalize(pulled(surface, vertices, weights, zero))
                 else:
                     w = within_face(vec3(), pa, pb, pc)
                     if w[3] > zero:
                         weights = vec4(one, -w[0], -w[1], -w[2])
                         normal = wp.normalize(wp.cross(pb - pa, pc - pa))
                 if weights[0] != zero or weights[1] != zero:
-                    if wp.dot(normal, pulled(surface, vertices, weights, zero)) < zero:
+                    came = pulled(surface, vertices, weights, zero)
+                    if wp.dot(normal, came) < zero:
                         normal = -normal
                     # what comes back to its side is no impact: the end is what counts
-                    if wp.dot(normal, pulled(surface, vertices, weights, one)) < zero:
+                    across = wp.dot(normal, came) > wp.float64(wp.static(ALONG)) * wp.length(came)
+                    if across and wp.dot(normal, pulled(surface, vertices, weights, one)) < zero:
                         note(impacts, vertices, weights, normal)
                         return
         weights = vec4()
@@ -254,7 +261,9 @@ def define() -> SimpleNamespace:
         if weights[0] != zero or weights[1] != zero:
             apart = pulled(surface, vertices, weights, one)
             distance = wp.length(apart)
-            if distance > zero and distance < near:
+            came = pulled(surface, vertices, weights, zero)
+            across = wp.dot(apart, came) > wp.float64(wp.static(ALONG)) * wp.length(came) * distance
+            if across and distance < near:
                 note(impacts, vertices, weights, apart / distance)
 
     @wp.func

@@ -4,7 +4,7 @@
 
 Its Karush–Kuhn–Tucker conditions are x = x₁ + M⁻¹ Gᵀ λ, λ ≥ 0, and s = G x − b ≥ 0 with λ·s = 0. With S = G M⁻¹ Gᵀ that
 is a linear complementarity problem, s = S λ − (b − G x₁), of each **zone**: impacts that have nodes in common. It is
-solved by pivoting, to rounding. Of what is active, A,
+solved by active sets, to rounding. Of what is active, A,
 
     ∂x/∂x₁ = 1 − M⁻¹ G_Aᵀ S_AA⁻¹ G_A,
 
@@ -151,8 +151,7 @@ def _regular(matrix: np.ndarray) -> np.ndarray:
 
 
 def _solve(rows: np.ndarray, weight: np.ndarray, violation: np.ndarray) -> np.ndarray:
-    """Solve s = S λ − violation, by turns of what is active: of all that is wrong as long as that gets less, else, by
-    Murty's rule, of the last, which ends (Júdice and Pires 1994)."""
+    """Find λ of a zone."""
     product = (rows * weight) @ rows.T
     size = np.sqrt(np.diag(product))
     # what nothing of can move
@@ -161,22 +160,54 @@ def _solve(rows: np.ndarray, weight: np.ndarray, violation: np.ndarray) -> np.nd
     matrix = _regular(product / np.outer(size, size))
     matrix[held, held] = 1.0
     wanted = np.where(held, -1.0, violation / size)
+    result = _by_blocks(matrix, wanted)
+    return (_one_by_one(matrix, wanted) if result is None else result) / size
+
+
+def _among(matrix: np.ndarray, wanted: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Solve for the active ones; the others are 0."""
+    result = np.zeros(len(wanted))
+    result[active] = np.linalg.solve(matrix[np.ix_(active, active)], wanted[active])
+    return result
+
+
+def _by_blocks(matrix: np.ndarray, wanted: np.ndarray) -> np.ndarray | None:
+    """Turn all that is wrong, active or not, as long as that gets less; None where it does not end (Júdice and
+    Pires 1994)."""
     active = wanted > 0.0
     least, patience = len(wanted) + 1, 3
-    result = np.zeros(len(wanted))
-    for _ in range(100 + 20 * len(wanted)):
-        result[:] = 0.0
-        result[active] = np.linalg.solve(matrix[np.ix_(active, active)], wanted[active])
+    while patience > 0:
+        result = _among(matrix, wanted, active)
         slack = matrix @ result - wanted
-        bound = ROUNDING * np.abs(wanted).max(initial=0.0)
-        wrong = np.where(active, result < 0.0, slack < -bound)
+        wrong = np.where(active, result < 0.0, slack < -ROUNDING * np.abs(wanted).max())
         if not wrong.any():
-            break
+            return result
         if wrong.sum() < least:
             least, patience = int(wrong.sum()), 3
-        elif patience > 0:
-            patience -= 1
         else:
-            wrong[: np.flatnonzero(wrong)[-1]] = False
+            patience -= 1
         active = active ^ wrong
-    return np.maximum(result, 0.0) / size
+    return None
+
+
+def _one_by_one(matrix: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Take in what is violated most, and leave out what would pull, step by step: each lessens the dual's energy
+    (Lawson and Hanson 1974)."""
+    result, active = np.zeros(len(wanted)), np.zeros(len(wanted), dtype=bool)
+    for _ in range(10 * len(wanted)):
+        left = np.where(active, 0.0, wanted - matrix @ result)
+        worst = int(left.argmax())
+        if left[worst] <= ROUNDING * np.abs(wanted).max():
+            break
+        active[worst] = True
+        while True:
+            target = _among(matrix, wanted, active)
+            pulls = active & (target <= 0.0)
+            if not pulls.any():
+                break
+            share = np.min(result[pulls] / np.maximum(result[pulls] - target[pulls], np.finfo(float).tiny))
+            result = result + share * (target - result)
+            active &= ~(pulls & (result <= ROUNDING * result.max(initial=0.0)))
+            result[~active] = 0.0
+        result = target
+    return result
