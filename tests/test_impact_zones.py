@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from internals import fails_at_first
 from scipy.optimize import minimize
 from warp_yarn.kernels.contact import continuous
 
@@ -509,9 +510,12 @@ def a_bent_state(size: int = 5) -> dict[str, torch.Tensor]:
 SCALES = {"position": 1e-5, "velocity": 1e-2, "gravity": 1.0, "yarn_density": 1e-4}
 
 
-def compare(scene: wy.Scene, steps: int, names: tuple[str, ...], bound: float, **options) -> wy.torch.Rollout:
+def compare(
+    scene: wy.Scene, steps: int, names: tuple[str, ...], bound: float, prepare=lambda simulator: None, **options
+) -> None:
     """A gradient with Richardson differences along one direction for each input."""
     rollout = wy.torch.Rollout(scene, steps, integrator="linear", frames=[steps], tolerance=1e-12, **options)
+    prepare(rollout.simulator)
     generator = torch.Generator().manual_seed(0)
     own = rollout.defaults
     given = {"gravity": own["gravity"], "yarn_density": own["density"], **a_bent_state()}
@@ -534,7 +538,6 @@ def compare(scene: wy.Scene, steps: int, names: tuple[str, ...], bound: float, *
         # beyond 1e-2 yarns buckle within the difference
         wanted = (4.0 * difference(1e-3) - difference(2e-3)) / 3.0
         assert float((leaves[name].grad * direction).sum()) == pytest.approx(wanted, rel=bound), name
-    return rollout
 
 
 GROUNDS = {
@@ -549,3 +552,16 @@ def test_gradients_through_impacts(ground, every):
     """On planes and flat faces normals do not turn: nothing is left out."""
     scene = wy.Scene(cloth(friction_damping=0.1), obstacles=[GROUNDS[ground]], contact=ZONES)
     compare(scene, 12, ("position", "velocity", "gravity", "yarn_density"), 1e-6, checkpoint_every=every)
+
+
+def test_gradients_through_an_impact_in_a_step_that_was_split():
+    ground = wy.Plane(point=(0.0, 0.0, -4e-4), normal=(0.0, 0.0, 1.0), friction=0.0)
+    scene = wy.Scene(cloth(friction_damping=0.1), obstacles=[ground], contact=ZONES)
+    seen = []
+
+    def prepare(simulator: wy.Simulator) -> None:
+        fails_at_first(simulator, 6e-4)
+        seen.append(simulator)
+
+    compare(scene, 4, ("position", "velocity", "gravity"), 1e-6, prepare=prepare)
+    assert list(seen[0].split_steps) == [1]
