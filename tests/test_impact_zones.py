@@ -254,7 +254,7 @@ def test_transposed_projection_against_differences(seed):
     rng = np.random.default_rng(seed + 100)
     adjoint, direction, of_mass = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), rng.normal(size=6)
     _, zones = project(position, inverse_mass, constraints)
-    to_position, to_mass = transposed(zones, inverse_mass, adjoint)
+    to_position, to_mass, *_ = transposed(zones, inverse_mass, adjoint)
 
     def move(size: float, by_mass: float) -> float:
         start, inverse = position + size * direction, 1.0 / (1.0 / inverse_mass + by_mass * of_mass)
@@ -565,3 +565,22 @@ def test_gradients_through_an_impact_in_a_step_that_was_split():
 
     compare(scene, 4, ("position", "velocity", "gravity"), 1e-6, prepare=prepare)
     assert list(seen[0].split_steps) == [1]
+
+
+def test_gradients_between_cloths():
+    """Where normals and weights follow from all positions, and the time of impacts matters."""
+    scene, state = two_sheets()
+    rollout = wy.torch.Rollout(scene, 12, step=5e-4, integrator="linear", frames=[12], tolerance=1e-12)
+    upper = torch.arange(scene.cloth.nodes) >= 25
+    given = {"position": torch.tensor(state.position), "velocity": torch.tensor(state.velocity)}
+
+    def height(speed: torch.Tensor) -> torch.Tensor:
+        velocity = given["velocity"].clone()
+        velocity[upper, 2] = -speed
+        return rollout(position=given["position"], velocity=velocity).velocity[-1][~upper, 2].mean()
+
+    speed = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    height(speed).backward()
+    with torch.no_grad():
+        wanted = (height(speed + 1e-6) - height(speed - 1e-6)) / 2e-6
+    assert float(speed.grad) == pytest.approx(float(wanted), rel=1e-5)

@@ -26,6 +26,8 @@ they came instead, and what is merely near is left to their ends."""
 ALONG = 1e-3
 """Of the way that two places came: what of it is along the normal. With less they moved in one plane, as edges do that
 lie above each other, whose ends meet instead; steps leave at least half the thickness between what slides."""
+PLANE, OF_FACE, OF_EDGES, OF_EDGES_ASKEW = 0, 1, 2, 3
+"""Kinds of impacts: what their normals follow from."""
 NONE = 2.0
 """In place of a root that is not there."""
 
@@ -180,17 +182,22 @@ def define() -> SimpleNamespace:
 
     @wp.struct
     class Impacts:
-        """What was found: four vertices, their weights, the normal; and how many there are, with room or not."""
+        """What was found: kind, time (1 of what is merely near), four vertices, their weights, the normal; and how many
+        there are, with room or not."""
 
         count: wp.array(dtype=int)
+        kinds: wp.array(dtype=int)
+        times: wp.array(dtype=wp.float64)
         vertices: wp.array(dtype=wp.vec4i)
         weights: wp.array(dtype=vec4)
         normals: wp.array(dtype=vec3)
 
     @wp.func
-    def note(impacts: Impacts, vertices: wp.vec4i, weights: vec4, normal: vec3):
+    def note(impacts: Impacts, kind: int, t: wp.float64, vertices: wp.vec4i, weights: vec4, normal: vec3):
         k = wp.atomic_add(impacts.count, 0, 1)
         if k < impacts.vertices.shape[0]:
+            impacts.kinds[k] = kind
+            impacts.times[k] = t
             impacts.vertices[k] = vertices
             impacts.weights[k] = weights
             impacts.normals[k] = normal
@@ -228,12 +235,15 @@ def define() -> SimpleNamespace:
                 pc = c + vc * t
                 weights = vec4()
                 normal = vec3()
+                kind = int(wp.static(OF_FACE))
                 if of_edges != 0:
                     st = crossing_edges(vec3(), pa, pb, pc)
                     if st[2] > zero:
                         weights = vec4(one - st[0], st[0], st[1] - one, -st[1])
                         normal = wp.normalize(wp.cross(pa, pc - pb))
+                        kind = wp.static(OF_EDGES)
                         if square_of_sine(pa, pc - pb) <= wp.float64(wp.static(ASKEW)):
+                            kind = wp.static(OF_EDGES_ASKEW)
                             normal = wp.normalize(pulled(surface, vertices, weights, zero))
                 else:
                     w = within_face(vec3(), pa, pb, pc)
@@ -247,7 +257,7 @@ def define() -> SimpleNamespace:
                     # what comes back to its side is no impact: the end is what counts
                     across = wp.dot(normal, came) > wp.float64(wp.static(ALONG)) * wp.length(came)
                     if across and wp.dot(normal, pulled(surface, vertices, weights, one)) < zero:
-                        note(impacts, vertices, weights, normal)
+                        note(impacts, kind, t, vertices, weights, normal)
                         return
         weights = vec4()
         if of_edges != 0:
@@ -264,7 +274,7 @@ def define() -> SimpleNamespace:
             came = pulled(surface, vertices, weights, zero)
             across = wp.dot(apart, came) > wp.float64(wp.static(ALONG)) * wp.length(came) * distance
             if across and distance < near:
-                note(impacts, vertices, weights, apart / distance)
+                note(impacts, wp.static(OF_FACE) + of_edges, one, vertices, weights, apart / distance)
 
     @wp.func
     def may_touch(surface: Surface, of_cloth: bool, face: int) -> bool:
@@ -341,7 +351,7 @@ def define() -> SimpleNamespace:
                 if (from_a > wp.float64(0.0)) != (from_b > wp.float64(0.0)):
                     x = a + (b - a) * (from_a / (from_a - from_b))
                     if within_face(x, p, surface.start[f[1]], surface.start[f[2]])[3] > wp.float64(0.0):
-                        note(impacts, wp.vec4i(e[0], f[0], f[1], f[2]), vec4(), vec3())
+                        note(impacts, 0, wp.float64(0.0), wp.vec4i(e[0], f[0], f[1], f[2]), vec4(), vec3())
 
     @wp.kernel(module=module, enable_backward=False)
     def solve_cubics(coefficients: wp.array(dtype=vec4), roots: wp.array(dtype=vec3)):

@@ -11,22 +11,23 @@ touched.
 Found on the device, solved by the host, in NumPy and between two captured graphs: a first version. Zones are small, but
 those of a sheet on a sheet grow with it, as the cube of their impacts.
 
-Gradients go back through the projection's conditions (``transposed``). What is active, normals and weights are held as
-they were found: the time of an impact, and what follows from it, is not differentiated, as it is not in the paper. On
-planes and flat faces that stand still nothing is left out by that.
+Gradients go back through the projections' conditions, round by round, with what is active held fixed; and, which the
+paper leaves out, through how normals and weights follow from the way of the step (``impact_geometry.py``), the time of
+an impact included.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..description.obstacles import Box
 from ..errors import InputError
 from ..kernels.core.status import OVERLAPPING, UNRESOLVED
+from .impact_geometry import adjoint
 from .impacts import Found, detection_of, none, turned
 from .projection import Constraints, NoWayOut, Zone, project, transposed
 
@@ -44,19 +45,32 @@ EXACT = 1e-6
 """Of the thickness: what is left of it satisfies a constraint."""
 
 
+class Round(NamedTuple):
+    """A look at the way of a step, and what followed from it."""
+
+    seen: np.ndarray
+    """The end of the way [nodes, 3] (m)."""
+    found: Found
+    """What was found there, beside what the rounds before found."""
+    zones: list[Zone]
+    """Of the projection from all of that."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Projected:
-    """A projection that was made, as its reverse needs it.
+    """What was done at the end of a step, as its reverse needs it.
 
     Args:
-        zones: of it.
+        rounds: of it.
+        start: of the step [nodes, 3] (m).
         inverse_mass: [nodes] (1/kg).
         length: Δs of every segment [segments] (m).
         move: what it moved nodes by [nodes, 3] (m).
         step: h (s).
     """
 
-    zones: list[Zone]
+    rounds: list[Round]
+    start: np.ndarray
     inverse_mass: np.ndarray
     length: np.ndarray
     move: np.ndarray
@@ -81,6 +95,7 @@ class ImpactZones:
         self._free = a["is_free"].numpy().astype(float)
         self._ends = 2 * topology.segment_nodes + topology.yarn_direction[topology.segment_yarn][:, None]
         self._start = self._position()
+        self._to_start: np.ndarray | None = None
 
     def _position(self) -> np.ndarray:
         return self.model.arrays["position"].numpy() + self.model.arrays.origin
@@ -99,31 +114,32 @@ class ImpactZones:
         length, inverse_mass = self._masses()
         end = self._position()
         try:
-            position, zones = self.resolve(self._start, end, inverse_mass)
+            position, rounds = self.resolve(self._start, end, inverse_mass)
         except NoWayOut as error:
             a.put("status", OVERLAPPING if self.rounds < MOST_ROUNDS else UNRESOLVED, error.node, 0)
             return
-        if zones:
+        if rounds:
             move, step = position - end, float(a["step_size"].numpy()[0])
             a["position"].assign(position - a.origin)
             a["velocity"].assign(a["velocity"].numpy() + move / step)
-            self.made[frame] = Projected(zones, inverse_mass, length, move, step)
+            self.made[frame] = Projected(rounds, self._start, inverse_mass, length, move, step)
 
-    def resolve(self, start: np.ndarray, end: np.ndarray, inverse_mass: np.ndarray) -> tuple[np.ndarray, list[Zone]]:
+    def resolve(self, start: np.ndarray, end: np.ndarray, inverse_mass: np.ndarray) -> tuple[np.ndarray, list[Round]]:
         """Find the place nearest to the end of a step that its start leads to without an impact.
 
         Raises:
             NoWayOut: there is none, or ``MOST_ROUNDS`` did not find it.
         """
-        position, found, zones = end, none(), []
+        position, found, rounds = end, none(), []
         near = self.thickness
         for self.rounds in range(MOST_ROUNDS):
             more = self.detection.find(start, position, near)
             more = more.pick(more.gap(self.detection.places(position)) < (1.0 - EXACT) * self.thickness)
             if not len(more.weights):
-                return position, zones
-            found = found.and_these(more)
+                return position, rounds
+            found, seen = found.and_these(more), position
             position, zones = project(end, inverse_mass, self._constraints(found))
+            rounds.append(Round(seen, more, zones))
             near = NEAR * self.thickness
         self.rounds = MOST_ROUNDS
         raise NoWayOut(self._node(more, 0))
@@ -161,13 +177,14 @@ class ImpactZones:
         that the step started from; and put what the step had solved for in ``solution``."""
         a = self.model.arrays
         made = self.made.get(int(a["counters"].numpy()[0]) + 1)
+        self._to_start = None
         if made is None:
             return
         a["solution"].assign(a["solution"].numpy() - made.move / made.step)
         at_end = a["position"].grad.numpy().astype(float)
         of_move = at_end + a["velocity"].grad.numpy() / made.step
-        to_position, to_mass = transposed(made.zones, made.inverse_mass, of_move)
-        a["position"].grad.assign(at_end + to_position)
+        self._to_start, to_end, to_mass = self._taken_back(made, of_move)
+        a["position"].grad.assign(at_end + to_end)
         topology = self.model.scene.cloth.topology
         to_half = 0.5 * to_mass[topology.segment_nodes].sum(axis=1)
         density, euler = a["density"], a["euler"]
@@ -179,6 +196,44 @@ class ImpactZones:
             ends = np.stack([-to_length, to_length], axis=1)
             to_euler = np.bincount(self._ends.ravel(), ends.ravel(), minlength=len(euler))
             euler.grad.assign(euler.grad.numpy() + to_euler)
+
+    def end_reverse(self) -> None:
+        """Add what the way's start has to do with impacts, once the running adjoints are those of the step's start."""
+        if self._to_start is not None:
+            gradient = self.model.arrays["position"].grad
+            gradient.assign(gradient.numpy() + self._to_start)
+
+    def _taken_back(self, made: Projected, of_move: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Take the adjoint of a move back through all rounds: to those of the step's start and end [nodes, 3], and of
+        the nodes' masses [nodes]."""
+        places, nodes = self.detection.places, self.detection.nodes
+        last = made.rounds[0].seen + made.move
+        ends = [*(one.seen for one in made.rounds[1:]), last]
+        to_seen = [np.zeros_like(of_move) for _ in made.rounds] + [of_move]
+        to_start, to_end, to_mass = np.zeros_like(last), np.zeros_like(last), np.zeros(nodes)
+        first = np.cumsum([0, *(len(one.found.times) for one in made.rounds)])
+        for r in reversed(range(len(made.rounds))):
+            back = transposed(made.rounds[r].zones, made.inverse_mass, to_seen[r + 1])
+            # what a later round looked at is the step's end, moved
+            to_end += back.to_position + (to_seen[r + 1] if r + 1 < len(made.rounds) else 0.0)
+            to_mass += back.to_mass
+            flow, placed = np.concatenate([back.flow, np.zeros_like(self.detection.fixed)]), places(ends[r])
+            for q in range(r + 1):
+                rows = (back.members >= first[q]) & (back.members < first[q + 1])
+                found = made.rounds[q].found.pick(back.members[rows] - first[q])
+                of = back.multipliers[rows, None, None], back.adjoints[rows, None, None]
+                row = of[0] * flow[found.vertices] - of[1] * placed[found.vertices]
+                parts = adjoint(
+                    found,
+                    places(made.start)[found.vertices],
+                    places(made.rounds[q].seen)[found.vertices],
+                    np.einsum("kij,kj->ki", row, found.normals),
+                    np.einsum("ki,kij->kj", found.weights, row),
+                )
+                of_cloth = found.vertices < nodes
+                for target, part in zip((to_start, to_seen[q]), parts, strict=True):
+                    np.add.at(target, found.vertices[of_cloth], part[of_cloth])
+        return to_start, to_end + to_seen[0], to_mass
 
     # -- the start ---------------------------------------------------------------------------------------------------
 

@@ -34,11 +34,15 @@ class Found:
         vertices: four of each, from ``nodes`` on those of obstacles [impacts, 4].
         weights: w [impacts, 4].
         normals: n [impacts, 3].
+        kinds: what n and w follow from (``continuous.py``) [impacts].
+        times: of the step, 1 of what is merely near [impacts].
     """
 
     vertices: np.ndarray
     weights: np.ndarray
     normals: np.ndarray
+    kinds: np.ndarray
+    times: np.ndarray
 
     def gap(self, places: np.ndarray) -> np.ndarray:
         """Compute n·Σ w x of all vertices' places [impacts] (m)."""
@@ -46,17 +50,20 @@ class Found:
 
     def pick(self, rows: np.ndarray) -> Found:
         """Take some of them."""
-        return Found(self.vertices[rows], self.weights[rows], self.normals[rows])
+        return Found(*(getattr(self, name)[rows] for name in NAMES))
 
     def and_these(self, others: Found) -> Found:
         """Join with others."""
-        names = ("vertices", "weights", "normals")
-        return Found(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in names))
+        return Found(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in NAMES))
+
+
+NAMES = tuple(field.name for field in dataclasses.fields(Found))
 
 
 def none() -> Found:
     """Make an empty one."""
-    return Found(np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4)), np.zeros((0, 3)))
+    whole = np.zeros(0, dtype=np.int32)
+    return Found(np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4)), np.zeros((0, 3)), whole, np.zeros(0))
 
 
 class Detection:
@@ -151,7 +158,9 @@ class Detection:
         gap = np.einsum("ipj,pj->ip", position[:, None] - points[None], self._normals)
         node, plane = np.nonzero(gap < near)
         vertices = np.column_stack([node, *[self._first_plane + plane] * 3]) if len(node) else none().vertices
-        return Found(vertices, np.tile([1.0, -1.0, 0.0, 0.0], (len(node), 1)), self._normals[plane])
+        weights = np.tile([1.0, -1.0, 0.0, 0.0], (len(node), 1))
+        kinds = np.full(len(node), continuous.PLANE, dtype=np.int32)
+        return Found(vertices, weights, self._normals[plane], kinds, np.ones(len(node)))
 
     def _search(self, names: list[str], start: np.ndarray, end: np.ndarray, reach: float, *near: float) -> Found:
         """Launch kernels, by name, over the hierarchy of faces, and again where there was no room for all impacts."""
@@ -171,14 +180,14 @@ class Detection:
                 if count <= self._room:
                     break
                 self._room = 2 * count
-            found = Found(*(getattr(impacts, name).numpy()[:count] for name in ("vertices", "weights", "normals")))
+            found = Found(*(getattr(impacts, name).numpy()[:count] for name in NAMES))
         # a GPU finds them in any order
         return found.pick(np.lexsort(found.vertices.T))
 
     def _new_impacts(self) -> Any:
         impacts = self._kernels["Impacts"]()
         impacts.count = wp.zeros(1, dtype=int, device=self.device)
-        for name, dtype in (("vertices", wp.vec4i), ("weights", wp.vec4d), ("normals", wp.vec3d)):
+        for name, dtype in zip(NAMES, (wp.vec4i, wp.vec4d, wp.vec3d, wp.int32, wp.float64), strict=True):
             setattr(impacts, name, wp.empty(self._room, dtype=dtype, device=self.device))
         return impacts
 

@@ -8,7 +8,8 @@ solved by active sets, to rounding. Of what is active, A,
 
     ∂x/∂x₁ = 1 − M⁻¹ G_Aᵀ S_AA⁻¹ G_A,
 
-and the mass of each node enters by M. Normals, weights and which impacts are active are held fixed there.
+and the mass of each node enters by M, normals and weights by G. Which impacts are active is held fixed there. With an
+adjoint ā of x and μ = S_AA⁻¹ G_A M⁻¹ ā, a row's is, at a node, λ v − μ x with v = M⁻¹ (ā − G_Aᵀ μ), and b's is μ.
 """
 
 from __future__ import annotations
@@ -54,11 +55,30 @@ class Zone:
         nodes: [nodes].
         rows: G_A [constraints, 3 nodes].
         multipliers: λ [constraints] (kg m).
+        members: which of all constraints they are [constraints].
     """
 
     nodes: np.ndarray
     rows: np.ndarray
     multipliers: np.ndarray
+    members: np.ndarray
+
+
+class Transposed(NamedTuple):
+    """What an adjoint of x, ā, gives to others."""
+
+    to_position: np.ndarray
+    """To that of x₁, beside ā itself [nodes, 3]."""
+    to_mass: np.ndarray
+    """To those of the nodes' masses [nodes]."""
+    flow: np.ndarray
+    """v [nodes, 3]."""
+    members: np.ndarray
+    """Which constraints are active [active]."""
+    multipliers: np.ndarray
+    """λ of these [active]."""
+    adjoints: np.ndarray
+    """μ of these [active]."""
 
 
 def project(position: np.ndarray, inverse_mass: np.ndarray, constraints: Constraints) -> tuple[np.ndarray, list[Zone]]:
@@ -89,31 +109,36 @@ def project(position: np.ndarray, inverse_mass: np.ndarray, constraints: Constra
         active = multipliers > 0.0
         if active.any():
             result[nodes] += move.reshape(-1, 3)
-            zones.append(Zone(nodes, rows[active], multipliers[active]))
+            zones.append(Zone(nodes, rows[active], multipliers[active], members[active]))
     return result, zones
 
 
-def transposed(zones: list[Zone], inverse_mass: np.ndarray, adjoint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Take the adjoint of the move x − x₁ back.
+def transposed(zones: list[Zone], inverse_mass: np.ndarray, adjoint: np.ndarray) -> Transposed:
+    """Take an adjoint of x back.
 
     Args:
         zones: of the projection.
         inverse_mass: as it was.
-        adjoint: of the move [nodes, 3].
-
-    Returns:
-        What it gives to the adjoint of x₁ [nodes, 3], and to that of the nodes' masses [nodes].
+        adjoint: ā [nodes, 3].
     """
-    to_position, to_mass = np.zeros_like(adjoint), np.zeros(len(adjoint))
+    to_position, to_mass, adjoints = np.zeros_like(adjoint), np.zeros(len(adjoint)), [np.zeros(0)]
     for zone in zones:
         inverse = inverse_mass[zone.nodes]
         weight, of_move = np.repeat(inverse, 3), adjoint[zone.nodes].ravel()
         matrix = _regular((zone.rows * weight) @ zone.rows.T)
-        back = zone.rows.T @ np.linalg.solve(matrix, zone.rows @ (weight * of_move))
+        adjoints.append(np.linalg.solve(matrix, zone.rows @ (weight * of_move)))
+        back = zone.rows.T @ adjoints[-1]
         to_position[zone.nodes] -= back.reshape(-1, 3)
         change = ((of_move - back) * (zone.rows.T @ zone.multipliers)).reshape(-1, 3).sum(axis=1)
         to_mass[zone.nodes] -= change * inverse**2
-    return to_position, to_mass
+    return Transposed(
+        to_position,
+        to_mass,
+        inverse_mass[:, None] * (adjoint + to_position),
+        np.concatenate([np.zeros(0, dtype=int), *(zone.members for zone in zones)]),
+        np.concatenate([np.zeros(0), *(zone.multipliers for zone in zones)]),
+        np.concatenate(adjoints),
+    )
 
 
 def components(constraints: Constraints, inverse_mass: np.ndarray) -> list[np.ndarray]:

@@ -98,6 +98,7 @@ class LinearlyImplicitEuler:
         self._graphs.run("restore", self._begin_backward)
         self.model.zones.reverse()
         self._graphs.run("reverse", self._end_backward)
+        self.model.zones.end_reverse()
 
     def _backward_step(self) -> None:
         self._begin_backward()
