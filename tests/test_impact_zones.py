@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from internals import fails_at_first
+from internals import fails_at_first, resolved_with_its_adjoint
 from scipy.optimize import minimize
 from warp_yarn.kernels.contact import continuous
 
@@ -507,18 +507,27 @@ def a_bent_state(size: int = 5) -> dict[str, torch.Tensor]:
     return {"position": torch.tensor(position), "velocity": torch.tensor(velocity)}
 
 
+SOURCES = {"gravity": "gravity", "yarn_density": "density"}
 SCALES = {"position": 1e-5, "velocity": 1e-2, "gravity": 1.0, "yarn_density": 1e-4}
 
 
 def compare(
-    scene: wy.Scene, steps: int, names: tuple[str, ...], bound: float, prepare=lambda simulator: None, **options
+    scene: wy.Scene,
+    steps: int,
+    names: tuple[str, ...],
+    bound: float,
+    *,
+    given: dict[str, torch.Tensor] | None = None,
+    prepare=lambda simulator: None,
+    **options,
 ) -> None:
     """A gradient with Richardson differences along one direction for each input."""
     rollout = wy.torch.Rollout(scene, steps, integrator="linear", frames=[steps], tolerance=1e-12, **options)
     prepare(rollout.simulator)
     generator = torch.Generator().manual_seed(0)
     own = rollout.defaults
-    given = {"gravity": own["gravity"], "yarn_density": own["density"], **a_bent_state()}
+    acts = {name: own[source] for name, source in SOURCES.items() if source in own}
+    given = {**acts, **(a_bent_state() if given is None else given)}
     at_position, at_velocity = torch.randn((2, scene.cloth.nodes, 3), dtype=torch.float64, generator=generator)
 
     def loss(values: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -567,20 +576,43 @@ def test_gradients_through_an_impact_in_a_step_that_was_split():
     assert list(seen[0].split_steps) == [1]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_adjoint_of_all_rounds_against_differences(seed):
+    """Of a way on which one sheet flies through another: faces, edges, times, and a second round."""
+    scene, state = two_sheets()
+    simulator = wy.Simulator(scene, step=5e-4, integrator="linear")
+    rng = np.random.default_rng(seed)
+    shape, upper = (scene.cloth.nodes, 3), np.arange(scene.cloth.nodes) >= 25
+    inverse_mass, adjoint = 1.0 / rng.uniform(0.5, 2.0, size=shape[0]), rng.normal(size=shape)
+    start = state.position + 2e-5 * rng.normal(size=shape)
+    end = start + 1e-4 * rng.normal(size=shape)
+    end[upper, 2] -= 1.5e-3 + 3e-4 * seed
+    directions = rng.normal(size=(2, *shape))
+    _, *gradients, active = resolved_with_its_adjoint(simulator, start, end, inverse_mass, adjoint)
+    assert sum(active[-1]) > 10
+
+    def move(by_start: float, by_end: float) -> float:
+        ends = start + by_start * directions[0], end + by_end * directions[1]
+        found, _, _, others = resolved_with_its_adjoint(simulator, *ends, inverse_mass, adjoint)
+        assert others == active
+        return float((adjoint * (found - ends[1])).sum())
+
+    e = 1e-9
+    for k, gradient in enumerate(gradients):
+        wanted = (move(*(e * np.eye(2)[k])) - move(*(-e * np.eye(2)[k]))) / (2.0 * e)
+        # rounding of places, 1e-18, over the difference
+        assert (gradient * directions[k]).sum() == pytest.approx(wanted, rel=1e-6)
+
+
 def test_gradients_between_cloths():
     """Where normals and weights follow from all positions, and the time of impacts matters."""
     scene, state = two_sheets()
-    rollout = wy.torch.Rollout(scene, 12, step=5e-4, integrator="linear", frames=[12], tolerance=1e-12)
-    upper = torch.arange(scene.cloth.nodes) >= 25
+    scene = wy.Scene(
+        [part.replace(friction_damping=0.1) for part in scene.cloth.cloths],
+        gravity=None,
+        self_contact=True,
+        contact=ZONES,
+    )
+    state.position += 3e-5 * np.random.default_rng(7).normal(size=state.position.shape)
     given = {"position": torch.tensor(state.position), "velocity": torch.tensor(state.velocity)}
-
-    def height(speed: torch.Tensor) -> torch.Tensor:
-        velocity = given["velocity"].clone()
-        velocity[upper, 2] = -speed
-        return rollout(position=given["position"], velocity=velocity).velocity[-1][~upper, 2].mean()
-
-    speed = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    height(speed).backward()
-    with torch.no_grad():
-        wanted = (height(speed + 1e-6) - height(speed - 1e-6)) / 2e-6
-    assert float(speed.grad) == pytest.approx(float(wanted), rel=1e-5)
+    compare(scene, 12, ("position", "velocity"), 1e-5, given=given, step=5e-4)

@@ -183,7 +183,7 @@ class ImpactZones:
         a["solution"].assign(a["solution"].numpy() - made.move / made.step)
         at_end = a["position"].grad.numpy().astype(float)
         of_move = at_end + a["velocity"].grad.numpy() / made.step
-        self._to_start, to_end, to_mass = self._taken_back(made, of_move)
+        self._to_start, to_end, to_mass = self.taken_back(made, of_move)
         a["position"].grad.assign(at_end + to_end)
         topology = self.model.scene.cloth.topology
         to_half = 0.5 * to_mass[topology.segment_nodes].sum(axis=1)
@@ -203,7 +203,7 @@ class ImpactZones:
             gradient = self.model.arrays["position"].grad
             gradient.assign(gradient.numpy() + self._to_start)
 
-    def _taken_back(self, made: Projected, of_move: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def taken_back(self, made: Projected, of_move: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take the adjoint of a move back through all rounds: to those of the step's start and end [nodes, 3], and of
         the nodes' masses [nodes]."""
         places, nodes = self.detection.places, self.detection.nodes
