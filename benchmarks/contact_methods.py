@@ -29,6 +29,7 @@ import numpy as np
 import warp as wp
 from common import RESULTS, Timing, environment, one_core, print_table, turns, write_csv
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from motions import distance
 from plots import COLORS, MARKERS, PICTURES, save
 
@@ -196,9 +197,11 @@ def draw(table: Sequence[dict[str, Any]], size: int) -> Figure:
             elif column == "energy gained":
                 # what is 0 has a place too
                 axis.set_yscale("symlog", linthresh=1e-6)
+                axis.set_ylim(bottom=-2e-7)
             else:
                 axis.axhline(1.0, color="0.6", linewidth=1.0, zorder=0)
             axis.grid(color="0.9")
+            axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].legend(frameon=False)
     return figure
 
@@ -207,9 +210,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=5, help="rows and columns (%(default)s)")
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS), help="(all)")
-    parser.add_argument(
-        "--steps", type=float, nargs="+", default=[2.0, 1.0, 0.5, 0.25, 0.125], help="in ms (2 ... 0.125)"
-    )
+    steps = [1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125]
+    parser.add_argument("--steps", type=float, nargs="+", default=steps, help="in ms (1, 1/2 ... 1/32)")
     parser.add_argument("--repeats", type=int, default=3, help="turns (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "contact_methods.csv", help="CSV file (%(default)s)")
     parser.add_argument("--plot", type=Path, default=PICTURES / "contact_methods.png", help="PNG file (%(default)s)")

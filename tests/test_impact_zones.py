@@ -240,7 +240,7 @@ def test_projection_of_many_and_of_the_same_twice():
 
 def test_what_is_held_leaves_no_way_out():
     position, inverse_mass, constraints = a_zone(3)
-    constraints = constraints._replace(limits=constraints.limits + 5.0)
+    constraints = Constraints(*constraints[:3], constraints.limits + 5.0)
     inverse_mass[:] = 0.0
     with pytest.raises(NoWayOut) as raised:
         project(position, inverse_mass, constraints)
