@@ -23,6 +23,7 @@ from collections.abc import Iterable, Sequence
 
 import warp as wp
 from warp_yarn.kernels import Variant, build
+from warp_yarn.kernels.contact import continuous
 
 
 def variants(quick: bool) -> list[Variant]:
@@ -35,6 +36,8 @@ def variants(quick: bool) -> list[Variant]:
 def modules(variants: Iterable[Variant]) -> list[str]:
     """Name the Warp modules of all kernels of these variants, each once."""
     kernels = itertools.chain.from_iterable(build(variant).values() for variant in variants)
+    # these are of no variant
+    kernels = itertools.chain(kernels, [continuous.define().find_vertices])
     return list(dict.fromkeys(kernel.module.name for kernel in kernels))
 
 

@@ -15,6 +15,7 @@ import warp_yarn as wy
 from warp_yarn.calibration.problem import CalibrationProblem
 from warp_yarn.device import exclusive, graphs
 from warp_yarn.device.contact import Near
+from warp_yarn.device.impact_zones import Projected
 from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
 from warp_yarn.view import render
@@ -242,3 +243,16 @@ unneeded: Callable = ablation._unneeded
 resampled: Callable = render._resampled
 pyvista: Callable = render._pyvista
 Camera, Picture = render._Camera, render._Picture
+
+
+def resolved_with_its_adjoint(
+    simulator: wy.Simulator, start: np.ndarray, end: np.ndarray, inverse_mass: np.ndarray, adjoint: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[list[int]]]:
+    """What impact zones do to a way: where it ends, adjoints of its start and end by one of the move, and how many
+    impacts are active in each zone of each round."""
+    zones = simulator.model.zones
+    found, rounds = zones.resolve(start, end, inverse_mass)
+    active = [[len(zone.multipliers) for zone in one.zones] for one in rounds]
+    made = Projected(rounds, start, inverse_mass, np.zeros(0), found - end, 1.0)
+    to_start, to_end, _ = zones.taken_back(made, adjoint)
+    return found, to_start, to_end, active

@@ -71,7 +71,7 @@ def test_scenes_refuse_what_is_no_obstacle() -> None:
         wy.Scene(paper(4, 4), contact={"friction": 0.3})
     with pytest.raises(wy.InputError, match="terms names 'obstacles', but there is no obstacle"):
         wy.Scene(paper(4, 4), terms=["obstacles"])
-    with pytest.raises(wy.InputError, match="terms names 'self_contact', but self_contact is False"):
+    with pytest.raises(wy.InputError, match="terms names 'self_contact', but there is no self_contact by a barrier"):
         wy.Scene(paper(4, 4), terms=["self_contact"])
 
 

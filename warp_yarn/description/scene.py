@@ -105,6 +105,7 @@ class Scene(Fixed):
         if contact is not None and not isinstance(contact, Contact):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
+        self.contact.check_obstacles(self.obstacles)
         self.terms = self._terms(terms)
         self._fix(
             cloth=self.cloth,
@@ -125,6 +126,16 @@ class Scene(Fixed):
 
     def __repr__(self) -> str:
         return f"Scene({self.cloth}, terms {', '.join(self.terms)}, sliding {self.sliding})"
+
+    @property
+    def has_barrier(self) -> bool:
+        """Tells whether what touches does so by a barrier."""
+        return self.contact.method == "barrier"
+
+    @property
+    def has_impact_zones(self) -> bool:
+        """Tells whether impact zones keep the cloth from obstacles and itself."""
+        return self.contact.method == "impact-zones" and (bool(self.obstacles) or self.self_contact)
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""What a model's cloth touches: arrays of obstacles and of the law, and the host's side of ``kernels/contact``."""
+"""What a model's cloth touches by a barrier: arrays of obstacles and of the law, and the host's side of
+``kernels/contact``. (``impact_zones.py`` has the other method.)"""
 
 from __future__ import annotations
 
@@ -62,10 +63,10 @@ def _steps(scene: Scene) -> int:
 def set_arrays(arrays: Arrays) -> None:
     """Fill the arrays of a scene's contact."""
     scene, cloth, contact = arrays.scene, arrays.scene.cloth, arrays.scene.contact
-    if scene.obstacles:
+    if "obstacles" in arrays.conditions:
         _set_law(arrays, "contact", contact.distance or cloth.radius, contact.range or cloth.radius)
         _set_obstacles(arrays, scene)
-    if scene.self_contact:
+    if "self-contact" in arrays.conditions:
         distance = contact.self_distance or max(1.5 * cloth.spacing, 3.0 * cloth.radius)
         reach = contact.self_range or cloth.spacing
         _set_law(arrays, "self_contact", distance, reach)
@@ -134,7 +135,7 @@ def _quaternions(arrays: Arrays, values: np.ndarray) -> wp.array:
 
 
 class Contact:
-    """The contact of a model's cloth with obstacles and with itself.
+    """The contact of a model's cloth with obstacles and with itself, by a barrier.
 
     Attributes:
         on: whether the scene has any.

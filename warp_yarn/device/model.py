@@ -21,6 +21,7 @@ from .declarations import INPUTS
 from .declared import arguments
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
+from .impact_zones import ImpactZones
 from .inputs import Inputs
 from .threads import SOLVED, Threads
 
@@ -43,7 +44,8 @@ class Model:
         arrays: by the names that kernels use.
         kernels: by name.
         inputs: those that change from step to step.
-        contact: what the cloth touches.
+        contact: what the cloth touches by a barrier.
+        zones: keep it apart otherwise; None: there are none.
         energy: the watch over it.
         threads: processor cores that share a linear solve.
         has_hard_pins: whether pins are exact.
@@ -75,11 +77,8 @@ class Model:
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
         self.tolerance = real("tolerance", tolerance, above=0.0)
-        if newton_tolerance is None and exact:
-            newton_tolerance = defaults.EXACT
-        if newton_tolerance is not None:
-            newton_tolerance = real("newton_tolerance", newton_tolerance, above=0.0)
-        self._newton_tolerance = newton_tolerance
+        given = defaults.EXACT if newton_tolerance is None and exact else newton_tolerance
+        self._newton_tolerance = given if given is None else real("newton_tolerance", given, above=0.0)
         if max_iterations is None:
             max_iterations = defaults.max_iterations(scene)
         self.max_iterations = integer("max_iterations", max_iterations, least=1)
@@ -92,6 +91,7 @@ class Model:
         self.set_times(self.step_size, self.step_size, self.step_size)
         self.inputs = Inputs(self)
         self.contact = Contact(self)
+        self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()

@@ -80,7 +80,7 @@ class Inputs:
             if getattr(state, name) is not None:
                 inputs[name] = getattr(state, name)
         values = {name: self.checked(name, value) for name, value in inputs.items()}
-        material = torch.as_tensor(self.cloth.material, device=self.device)
+        material = torch.tensor(self.cloth.material, device=self.device)
         for name in self.of_yarns:
             if name in values and f"yarn_{name}" in values:
                 raise InputError(f"{name} and yarn_{name} are both given, must be one of them")
@@ -127,7 +127,7 @@ class Inputs:
 def obstacle_shapes(simulator: Simulator) -> dict[str, tuple[int, ...]]:
     """Lists the inputs that say where obstacles are and what they are like, with their shapes."""
     count = len(simulator.scene.obstacles)
-    if not count:
+    if not simulator.model.contact.obstacles:
         return {}
     shapes: dict[str, tuple[int, ...]] = {"obstacle_size": (count, 3), "obstacle_friction": (count,)}
     rest = (-1, count) if simulator.model.contact.obstacles_move else (count,)

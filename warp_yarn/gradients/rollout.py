@@ -172,7 +172,7 @@ class _Forward(torch.autograd.Function):
         values = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
         frames, kept = run.forward(values, steps_done, differentiable=True)
         ctx.run, ctx.names, ctx.steps_done = run, names, steps_done
-        ctx.kept_names, ctx.split = tuple(kept.states), kept.split
+        ctx.kept_names, ctx.split, ctx.projected = tuple(kept.states), kept.split, kept.projected
         ctx.save_for_backward(*tensors, *kept.states.values())
         ctx.set_materialize_grads(False)
         return tuple(frames[name] for name in FIELDS)
@@ -182,7 +182,7 @@ class _Forward(torch.autograd.Function):
         """Asks for the gradients of those inputs that need one."""
         ctx.wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[3:], strict=True) if needed]
         saved, inputs = ctx.saved_tensors, len(ctx.names)  # once: torch.utils.checkpoint gives them no second time
-        kept = Kept(dict(zip(ctx.kept_names, saved[inputs:], strict=True)), ctx.split)
+        kept = Kept(dict(zip(ctx.kept_names, saved[inputs:], strict=True)), ctx.split, ctx.projected)
         found = _Backward.apply(ctx, kept, *losses, *saved[:inputs])
         gradients = dict(zip(ctx.wanted, found, strict=True))
         return (None, None, None, *(gradients.get(name) for name in ctx.names))
