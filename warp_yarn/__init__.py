@@ -10,7 +10,7 @@ from .description.cloths import Cloths
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
-from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
+from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError, WarpYarnWarning
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
 from .io.published import Published, read_published
@@ -50,6 +50,7 @@ __all__ = [
     "TriangleMesh",
     "Variant",
     "WarpYarnError",
+    "WarpYarnWarning",
     "Weave",
     "Wind",
     "Yarn",

@@ -109,6 +109,20 @@ class EnergyWatch:
             self.model.launch("add_pin_power", "pins", step_duration=self.model.step_size)
         self.model.contact.add_power()
 
+    def power_of(self, name: str) -> float:
+        """Compute the power at the present state of a term that does work, or of moving obstacles, "contact" [W]."""
+        a = self.model.arrays
+        a.zero("power")
+        if name == "contact":
+            self.model.contact.find()
+            self.model.contact.add_power()
+            return float(a["power"].numpy()[0])
+        term = next(term for term in self._outer if term.name == name)
+        a.zero("q_x")
+        self.model.launch_term(term, matrix=0, add_contact_load=0, force=a["q_x"])
+        force, velocity = (a[name].numpy().astype(np.float64) for name in ("q_x", "velocity"))
+        return float(np.sum(force * velocity))
+
     def end_step(self, *, by_stages: bool) -> None:
         """Compares the energy at the end of a step with the work done in it."""
         if not self.on:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from ..description.levels import BLOCKS
@@ -206,6 +207,23 @@ class Model:
         kernel = f"{self.preconditioner}_conjugate_gradient"
         options = {} if self.preconditioner == "jacobi" else {"thread": thread}
         self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
+
+    def subtract_product(self) -> None:
+        """Take A w, of the solution, off the right-hand side."""
+        a = self.arrays
+        a.zero("q_x", "q_s")
+        self.launch("apply_matrix", 1, p_x=a["solution"], p_s=a["euler_solution"])
+        for name, product in (("rhs", "q_x"), ("euler_rhs", "q_s")):
+            if a[name] is not None:
+                a[name].assign(a[name].numpy() - a[product].numpy())
+
+    @property
+    def held(self) -> np.ndarray:
+        """Which coordinates do not move by forces [nodes, 5]: x of exact pins."""
+        result = np.zeros((self.scene.cloth.nodes, 5), dtype=bool)
+        if self.has_hard_pins:
+            result[self.scene.pins, :3] = True
+        return result
 
     def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""

@@ -41,7 +41,7 @@ class Inspection:
         """
         a, cloth, result = self.model.arrays, self.model.scene.cloth, {}
         crossing = np.repeat(cloth.topology.is_crossing != 0, 2)
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             total = np.zeros(2 * cloth.nodes)
             for term in a.terms:
@@ -71,7 +71,7 @@ class Inspection:
         a = self.model.arrays
         if not a.contact:
             raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             load = a["contact_load"].numpy().astype(np.float64)
             return a["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
@@ -86,7 +86,7 @@ class Inspection:
         if self.model.zones is not None:
             raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
         contact, found = self.model.contact, []
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
             if contact.obstacles:
                 found.append(contact.near_obstacles())
@@ -116,7 +116,7 @@ class Inspection:
         contact = self.model.contact
         if not contact.on:
             return
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move
             where_known = state is None or not contact.obstacles_move
@@ -135,7 +135,7 @@ class Inspection:
         """Tells what is nearest to a node of the present state, with obstacles where the next step
         has them; or ""."""
         contact = self.model.contact
-        with _Visit(self.stepper, None, ahead=True):
+        with Visit(self.stepper, None, ahead=True):
             found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
             found += [contact.near_obstacles()] if contact.obstacles else []
             found += [self._with_room(contact.near_faces)] if contact.has_mesh else []
@@ -167,7 +167,7 @@ class Inspection:
     def energy(self, state: State | None = None) -> dict[str, float]:
         """Computes the energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.model.arrays, {}
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             energy = a.zeros(1, a.variant.scalar)
             for term in a.terms:
@@ -188,23 +188,26 @@ class Inspection:
             weights: factors of M, D and H in its matrix; None: 1, h and h².
         """
         h = self.model.step_size
-        with _Visit(self.stepper, state, ahead=True):
+        with Visit(self.stepper, state, ahead=True):
             self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return read_system(self.model)
 
 
-class _Visit:
+class Visit:
     """Another state for as long as a block lasts; the arrays that a step works with are free for it.
 
-    Pins and applied forces are those of the last step, or, if asked for, of the next one.
+    Pins and applied forces are those of the last step, or, if asked for, of the next one, or of the step after so many
+    (``row``), whose stages are then at their times.
     """
 
-    def __init__(self, stepper: Stepper, state: State | None, *, ahead: bool = False):
+    def __init__(self, stepper: Stepper, state: State | None, *, ahead: bool = False, row: int | None = None):
         self.stepper = stepper
-        self.ahead = ahead
-        self.row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.ahead, self.by_stages = ahead, row is not None
+        if row is None:
+            row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.row = row
         self.visited = None if state is None else checked_state(state, stepper.model.scene)
 
     def __enter__(self) -> None:
@@ -219,9 +222,10 @@ class _Visit:
 
         stepper.owe(go_home)
         model.arrays.put("counters", 0, self.row)
-        # before the first step, pins are where they start
-        model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
-        model.inputs.load()
+        if not self.by_stages:
+            # before the first step, pins are where they start
+            model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
+            model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
 

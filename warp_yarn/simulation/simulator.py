@@ -21,7 +21,7 @@ from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
 from .diagnosis import Failure
 from .frames import Frames
-from .inspection import Inspection
+from .loads import Loads
 from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
@@ -39,7 +39,7 @@ def _of_stepper(name: str) -> Any:
     )
 
 
-class Simulator(Inspection):
+class Simulator(Loads):
     """Simulates a scene.
 
     Threads may share one, and simulators may run in several threads: each call is as if it were alone. After an

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..device.declarations import FRAMES
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from ..device.graphs import GraphCache
 from ..device.model import Model
@@ -36,6 +37,24 @@ class _StepInParts:
     frame: int
     counts: tuple[float, int, int, int]
     ledger: dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of a step, or all of one.
+
+    Args:
+        method: that made it.
+        size: of the step.
+        left: part of the step that was left when it began.
+        before, after: the states at its ends.
+    """
+
+    method: Any
+    size: float
+    left: float
+    before: State
+    after: State
 
 
 class Stepper:
@@ -238,3 +257,36 @@ class Stepper:
             self.damped_steps.add(self.steps_done + frame + 1)
         self._step_in_parts = None
         return True
+
+    def remade(self, *, gained: bool, size: float) -> list[Part]:
+        """Makes a step in parts again, from the present state, and leaves no trace but that state.
+
+        Args:
+            gained: whether it gained energy when made at once.
+            size: of the first part, in steps.
+
+        Returns:
+            Its parts; none where one cannot be made.
+        """
+        a, parts, frames = self.arrays, self.substepping, self.frames
+        found: list[Part] = []
+        at = [frames.state()]
+
+        def look(method: Any, size: float, left: float) -> None:
+            found.append(Part(method, size, left, at[-1], frames.state()))
+            at.append(found[-1].after)
+
+        frame, row = (int(value) for value in a["counters"].numpy())
+        kept = {name: a[name].numpy().copy() for name in (*LEDGER, *FRAMES) if a.get(name) is not None}
+        counts, watcher = parts.counts, parts.watcher
+        self.model.energy.forget()
+        a.put("status", 0, 0, 0)
+        parts.next_size, parts.watcher = size, look
+        try:
+            made = parts.make(lambda: a.put("counters", frame, row), gained=gained)
+        finally:
+            parts.counts, parts.watcher = counts, watcher
+            a.put("status", 0, 0, 0)
+            for name, value in kept.items():
+                a[name].assign(value)
+        return found if made else []
