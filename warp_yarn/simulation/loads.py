@@ -1,4 +1,4 @@
-"""Forces that a test reads: reactions of pins, the work that is done."""
+"""Forces that a test reads: reactions of pins, the work that is done, and the equilibrium."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from .alone import alone
 from .inspection import Inspection
+from .relaxation import Relaxation, Relaxed
 from .reactions import Steps, reactions, work
 from .state import Trajectory
 
@@ -53,3 +54,25 @@ class Loads(Inspection):
         """
         steps = Steps(self.stepper, trajectory)
         return {name: steps.shaped(values) for name, values in work(steps).items()}
+
+    @alone
+    def relax(self, *, residual: float | None = None, most: int = 1000) -> Relaxed:
+        """Brings the cloth to rest in equilibrium, which is the state then; ``steps_done`` stays as it is.
+
+        Pins and applied forces stay where the last step has them. Friction between yarns holds, by its springs; that
+        on obstacles and of cloth on cloth acts by speed, and holds nothing at rest. It has no gradient itself: a
+        Rollout of one long step from its state has (``docs/forces.md``).
+
+        Args:
+            residual: the largest force to leave on a node, or along a yarn at a crossing [N], above 0; None: 1e-3 of
+                a node's mean weight, or more where rounding leaves more.
+            most: implicit steps to try, at least 1.
+
+        Returns:
+            The residual, the steps that were tried and the pins' reactions [pins, 3] (N).
+
+        Raises:
+            InputError: nothing holds a cloth that forces move as a whole; an obstacle that moves; impact zones.
+            SimulationError: there is none, or it was not found; the state is as before.
+        """
+        return Relaxation(self.stepper, residual, most).find()
