@@ -40,6 +40,7 @@ class Model:
     Args:
         scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations, threads,
             differentiable: as of the Simulator.
+        hooked: whether it has a hook.
 
     Attributes:
         arrays: by the names that kernels use.
@@ -65,6 +66,7 @@ class Model:
         max_iterations: int | None,
         threads: int,
         differentiable: bool,
+        hooked: bool = False,
     ):
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {scene!r}, must be a Scene")
@@ -90,7 +92,7 @@ class Model:
         _check_inputs(self)
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
-        self.inputs = Inputs(self)
+        self.inputs = Inputs(self, hooked=hooked)
         self.contact = Contact(self)
         self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)

@@ -18,6 +18,9 @@ from .linear_system import LinearSystem, read_system
 from .state import FIELDS, State
 from .stepper import Stepper
 
+GIVEN = ("gravity", "wind_velocity", "gust", "applied_force", "applied_force_path")
+"""Arrays that functions are evaluated into."""
+
 
 class Inspection:
     """Looks into the present state or another one, and leaves no trace. The base of the simulator, which has these:
@@ -199,21 +202,33 @@ class Visit:
     """Another state for as long as a block lasts; the arrays that a step works with are free for it.
 
     Pins and applied forces are those of the last step, or, if asked for, of the next one, or of the step after so many
-    (``row``), whose stages are then at their times.
+    (``row``), whose stages are then at their times. Functions are evaluated where the cloth is, or where that step
+    began.
     """
 
-    def __init__(self, stepper: Stepper, state: State | None, *, ahead: bool = False, row: int | None = None):
+    def __init__(
+        self,
+        stepper: Stepper,
+        state: State | None,
+        *,
+        ahead: bool = False,
+        row: int | None = None,
+        begun: np.ndarray | None = None,
+    ):
         self.stepper = stepper
         self.ahead, self.by_stages = ahead, row is not None
         if row is None:
             row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
-        self.row = row
+        self.row, self.begun = row, begun
         self.visited = None if state is None else checked_state(state, stepper.model.scene)
 
     def __enter__(self) -> None:
         stepper, model, home = self.stepper, self.stepper.model, {}
         if self.visited is not None:
             home = {name: model.arrays[name].numpy().copy() for name in FIELDS if stepper.frames.moves(name)}
+        if model.inputs.functions:
+            given = [name for name in GIVEN if model.arrays.get(name) is not None]
+            home |= {name: model.arrays[name].numpy().copy() for name in given}
 
         def go_home() -> None:
             for name, value in home.items():
@@ -222,6 +237,9 @@ class Visit:
 
         stepper.owe(go_home)
         model.arrays.put("counters", 0, self.row)
+        if model.inputs.functions:
+            begun = self.visited.position if self.begun is None and self.visited is not None else self.begun
+            model.inputs.evaluate(self.row, stepper.frames.state().position if begun is None else begun)
         if not self.by_stages:
             # before the first step, pins are where they start
             model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)

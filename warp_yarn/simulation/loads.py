@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
+from ..device.model import Model
+from ..errors import InputError, finite_array
 from .alone import alone
 from .inspection import Inspection
-from .relaxation import Relaxation, Relaxed
 from .reactions import Steps, reactions, work
+from .relaxation import Relaxation, Relaxed
 from .state import Trajectory
 
 
@@ -56,6 +61,37 @@ class Loads(Inspection):
         return {name: steps.shaped(values) for name, values in work(steps).items()}
 
     @alone
+    def set_inputs(
+        self, *, gravity: Any = None, wind: Any = None, forces: Mapping[int, Any] | None = None, pins: Any = None
+    ) -> None:
+        """Sets inputs from the next step on, as a hook does before each; what is None stays as it is.
+
+        Args:
+            gravity: 3 numbers [m/s²], where the scene has gravity.
+            wind: the air's velocity, 3 numbers [m/s], where the scene has a wind.
+            forces: {node: 3 numbers} [N], nodes that the scene has a force on.
+            pins: where the next step brings the pins [pins, 3] (m), where the scene has a pin_path with a row for it.
+
+        Raises:
+            InputError: what the scene does not have, or is given by a function.
+        """
+        checked = checked_inputs(self.model, self.stepper.steps_done, gravity=gravity, wind=wind, pins=pins)
+        of_nodes = checked_forces(self.model, forces)
+        for name, value in checked.items():
+            self.model.inputs.put(name, value, first=self.stepper.steps_done)
+        for node, force in of_nodes.items():
+            self.model.inputs.put("applied_force", force, first=self.stepper.steps_done, node=node)
+        if not self.model.inputs.hooked:
+            # another height or place is no gain of energy; where a hook sets them, the watch counts their work
+            self.stepper.owe(self.model.energy.forget)
+            self.stepper.pay()
+
+    @property
+    def time(self) -> float:
+        """Time since the beginning [s]: steps_done times the step."""
+        return self.stepper.steps_done * self.model.step_size
+
+    @alone
     def relax(self, *, residual: float | None = None, most: int = 1000) -> Relaxed:
         """Brings the cloth to rest in equilibrium, which is the state then; ``steps_done`` stays as it is.
 
@@ -76,3 +112,43 @@ class Loads(Inspection):
             SimulationError: there is none, or it was not found; the state is as before.
         """
         return Relaxation(self.stepper, residual, most).find()
+
+
+def checked_inputs(model: Model, steps_done: int, **given: Any) -> dict[str, np.ndarray]:
+    """Checks gravity, wind and pins that are not None; gives values by the names of arrays."""
+    arrays = {"gravity": "gravity", "wind": "wind_velocity", "pins": "pin_target"}
+    result = {}
+    for name, value in given.items():
+        if value is None:
+            continue
+        if name in model.scene.functions:
+            raise InputError(f"{name} cannot be set: the scene gives it by a function")
+        count = len(model.scene.pins)
+        result[arrays[name]] = finite_array(name, value, (count, 3) if name == "pins" else (3,))
+        if name == "pins":
+            rows = 0 if model.scene.pin_path is None else len(model.scene.pin_path)
+            if steps_done >= rows:
+                raise InputError(
+                    f"pins cannot be set after {steps_done} steps: scene.pin_path has {rows} rows, must have one for "
+                    "every step to set"
+                )
+            result[arrays[name]] -= model.arrays.origin
+        elif arrays[name] not in model.arrays:
+            raise InputError(f"{name} cannot be set: the scene has none; make it with one, if of 0")
+    return result
+
+
+def checked_forces(model: Model, forces: Any) -> dict[int, np.ndarray]:
+    """Checks {node: 3 numbers}."""
+    if forces is None:
+        return {}
+    if not isinstance(forces, Mapping):
+        raise InputError(f"forces = {forces!r}, must be a dictionary, {{node: 3 numbers}}")
+    result = {}
+    for node, force in forces.items():
+        if node in model.scene.functions:
+            raise InputError(f"forces[{node}] cannot be set: the scene gives it by a function")
+        if node not in model.scene.force_nodes.tolist():
+            raise InputError(f"forces names node {node!r}, must be one that the scene has a force on, if of 0")
+        result[node] = finite_array(f"forces[{node}]", force, (3,))
+    return result

@@ -56,6 +56,10 @@ class Steps:
                 raise InputError(f"trajectory = {trajectory!r}, must be a Trajectory or None")
             if not trajectory.cloth.same_as(scene.cloth):
                 raise InputError("trajectory.cloth is another one than that of the simulator")
+            if self.model.inputs.hooked:
+                raise InputError(
+                    "trajectory with a hook, whose inputs are not known any more: ask for the last step, as in the hook"
+                )
             if trajectory.step != self.model.step_size:
                 raise InputError(f"trajectory.step = {trajectory.step:g}, must be {self.model.step_size:g}")
             self.frames, self.start = trajectory, trajectory.start
@@ -70,7 +74,7 @@ class Steps:
 
     def visit(self, k: int, state: State) -> Visit:
         """Visits a state for as long as a block lasts, with the inputs of step k."""
-        return Visit(self.stepper, state, row=self.start + k)
+        return Visit(self.stepper, state, row=self.start + k, begun=self.frames[k].position)
 
     def parts(self, k: int) -> list[Part]:
         """Finds the parts that step k was made in: one, where it was made at once; none, with a warning to the caller's
@@ -178,8 +182,7 @@ def _warn_where_springs_give_way(steps: Steps, forces: np.ndarray) -> None:
 def work(steps: Steps) -> dict[str, np.ndarray]:
     """Computes the work that was done from outside in each step [steps] (J), by who did it."""
     model, h = steps.model, steps.model.step_size
-    names = [term.name for term in model.arrays.terms if term.works]
-    names += ["contact"] if model.contact.obstacles_move else []
+    names = model.energy.workers
     result = {name: np.zeros(len(steps)) for name in names}
     for k in range(len(steps)):
         parts = steps.parts(k) if names else []

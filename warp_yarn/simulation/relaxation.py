@@ -148,6 +148,8 @@ class Relaxation:
         # pins and forces stay where the last step has brought them; before the first one, where they start
         self.arrays.put("stage_times", *[float(done > 0)] * 4)
         self.arrays.put("counters", 0, max(0, done - 1))
+        if self.model.inputs.functions:
+            self.model.inputs.evaluate(max(0, done - 1), self.frames.state().position)
 
     def _forces(self) -> np.ndarray:
         """Computes the forces on the cloth at rest, along x and (u, v) [nodes, 5] (N)."""

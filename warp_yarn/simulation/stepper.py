@@ -72,6 +72,7 @@ class Stepper:
         steps_done: steps since the beginning.
         split_steps: which of them could not be made at once by the method, and their smallest part [s].
         damped_steps: those of them that the fallback made, or parts of them.
+        before_step: a hook, called before each step; None: there is none.
     """
 
     def __init__(self, model: Model, integrator: Any, substepping: Substepping, frames: Frames):
@@ -80,6 +81,7 @@ class Stepper:
         self.steps_done = 0
         self.split_steps: dict[int, float] = {}
         self.damped_steps: set[int] = set()
+        self.before_step: Callable[[], None] | None = None
         self._graphs = GraphCache(model.device)
         self._chunk: int | None = None
         """Steps done when the chunk began that is being made, and None where none is: frames on the device."""
@@ -165,6 +167,8 @@ class Stepper:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
         try:
+            if self.before_step is not None or self.model.inputs.functions:
+                self._prepare()
             with ALONE, compiling():
                 refuse_recording(self.model.device)
                 self.settle()
@@ -173,6 +177,29 @@ class Stepper:
             return self._make_steps(steps)
         finally:
             self._end_team()
+
+    def _prepare(self) -> None:
+        """Lets a hook and functions set the inputs of the next step; a chunk is one step then.
+
+        Raises:
+            InputError: a hook that moved the simulator on, or elsewhere.
+        """
+        with ALONE:
+            self.settle()
+        if self.before_step is not None:
+            before = self._fixed()
+            self.before_step()
+            if self._fixed() != before:
+                raise InputError("a hook made steps or set the state, may read it and set inputs")
+        if self.model.inputs.functions:
+            with ALONE, compiling():
+                self.settle()
+                self.model.inputs.evaluate(self.steps_done, self.frames.state().position)
+
+    def _fixed(self) -> tuple[Any, ...]:
+        """Gives what a hook may not change: the steps that were made, and the frames that are kept."""
+        recording = self.frames.recording
+        return self.steps_done, self.frames.filled, recording, recording is not None and recording.open
 
     def _make_steps(self, steps: int) -> int:
         base = self.steps_done
