@@ -116,6 +116,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     kernels = {
         "contact_normal": crossing_normal.define_normal(variant),
         "update_anchor": friction.define_anchor(variant),
+        "gusty_wind": wind.define_gusty(variant),
     }
     for term in _OWN:
         kernels[term.name] = term.define(variant)

@@ -19,10 +19,19 @@ from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
+    return _define(variant, gusty=False)
+
+
+def define_gusty(variant: Variant) -> wp.Kernel:
+    """Define the kernel of wind with gusts, in a module of its own: who has none does not compile it."""
+    return _define(variant, gusty=True)
+
+
+def _define(variant: Variant, *, gusty: bool) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     BlockMatrix = structs(variant).BlockMatrix
 
-    @variant.kernel("terms")
+    @variant.kernel("gusts" if gusty else "terms")
     def wind_term(
         # topology
         triangle_nodes: wp.array(dtype=wp.vec3i),
@@ -52,7 +61,7 @@ def define(variant: Variant) -> wp.Kernel:
         n = wp.normalize(cross)
         mean_velocity = (velocity[i] + velocity[j] + velocity[k]) * third
         relative = wind_velocity[0] - mean_velocity
-        if gust:
+        if wp.static(gusty):
             relative += (gust[i] + gust[j] + gust[k]) * third
         v_n = wp.dot(n, relative)
         pressure = wind_density[0] * area * wp.abs(v_n)

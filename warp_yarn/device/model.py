@@ -267,7 +267,11 @@ def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
     """Builds the kernels of a scene's terms, of which one may have been registered when the scene was made."""
     for name in scene.terms:
         choice("scene.terms", name, TERMS)
-    return build(variant, scene.terms)
+    kernels = build(variant, scene.terms)
+    if scene.has_gusts:
+        gusty = {name.removeprefix("gusty_"): name for name in kernels if name.startswith("gusty_")}
+        kernels = kernels | {name: kernels[other] for name, other in gusty.items()}
+    return kernels
 
 
 def _check_inputs(model: Model) -> None:
