@@ -77,7 +77,7 @@ def learnable(scene: Scene) -> dict[str, int | None]:
         result |= {"wind_density": None, "wind_drag": None}
         if np.shape(scene.wind.velocity) == (3,):
             result["wind_velocity"] = 3
-    if np.shape(scene.gravity) == (3,):
+    if scene.gravity is not None and np.shape(scene.gravity) == (3,):
         result["gravity"] = 3
     if len(scene.pins) and scene.pin_stiffness is not None:
         result["pin_stiffness"] = None
@@ -130,7 +130,7 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
             velocity = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(velocity))
         rest = {OF_WINDS[name]: parts[name, None] for name in ("wind_density", "wind_drag") if (name, None) in parts}
         changes["wind"] = dataclasses.replace(scene.wind, velocity=velocity, **rest)
-    if np.shape(scene.gravity) == (3,):
+    if scene.gravity is not None and np.shape(scene.gravity) == (3,):
         changes["gravity"] = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
     if ("pin_stiffness", None) in parts:
         changes["pin_stiffness"] = parts["pin_stiffness", None]

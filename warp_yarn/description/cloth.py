@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, NoAttributeError, choice, finite_array, indices, real
+from ..errors import InputError, choice, finite_array, indices, real
+from .fixed import Fixed, Replaceable, says_why
+from .sanity import warn_of_units
 from .topology import Topology, rectangle
 from .weave import Weave
 
 
+@says_why
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Yarn:
+class Yarn(Replaceable):
     """A yarn material (paper, table 1).
 
     Args:
@@ -55,43 +58,6 @@ CLOTH_NUMBERS = (
 """The cloth's own numbers, as its arguments and the kernels' arrays name them."""
 
 POSES = ("upright", "flat")
-
-
-class Fixed:
-    """What cannot be changed once it is made: simulators take its values when they are made themselves."""
-
-    _arguments: dict[str, Any]
-    """All that it was made of."""
-
-    def _fix(self, **arguments: Any) -> None:
-        """Ends the making: arrays and attributes are read-only from now on."""
-        self._arguments = arguments
-        for value in vars(self).values():
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if "_arguments" in vars(self):
-            kind = type(self).__name__
-            raise NoAttributeError(
-                f"{kind.lower()}.{name} cannot be set: a {kind} does not change once it is made, and simulators would "
-                f"not know; make another one, such as by {kind.lower()}.replace({name}=...)"
-            )
-        super().__setattr__(name, value)
-
-    def __delattr__(self, name: str) -> None:
-        raise NoAttributeError(f"{type(self).__name__.lower()}.{name} cannot be deleted")
-
-    def replace(self, **changes: Any) -> Any:
-        """Makes another one, of the same arguments but for these.
-
-        Raises:
-            InputError: an argument that there is not, or a value that does not go with the others.
-        """
-        for name in changes:
-            if name not in self._arguments:
-                raise InputError(f"replace({name}=...): must be one of {', '.join(self._arguments)}")
-        return type(self)(**{**self._arguments, **changes})
 
 
 class Cloth(Fixed):
@@ -171,6 +137,7 @@ class Cloth(Fixed):
             friction_damping=None if friction_damping is None else self.friction_damping,
             pose=pose if isinstance(pose, str) else self.position,
         )
+        warn_of_units(self)
 
     def __repr__(self) -> str:
         return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"

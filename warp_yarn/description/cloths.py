@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import InputError
-from .cloth import CLOTH_NUMBERS, Cloth, Fixed
+from .cloth import CLOTH_NUMBERS, Cloth
+from .fixed import Fixed
 from .topology import Topology, side_by_side
 
 APART = 1e3

@@ -11,14 +11,17 @@ import numpy as np
 
 from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
-from .cloth import Cloth, Fixed
+from .cloth import Cloth
 from .cloths import Cloths, as_one
+from .fixed import Fixed, Replaceable, says_why
 from .obstacles import Contact, Obstacle
-from .varying import checked_vectors, kind_of, of_time
+from .sanity import warn_of_acceleration, warn_of_speed
+from .varying import checked_vectors, of_time
 
 
+@says_why
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Wind:
+class Wind(Replaceable):
     """A wind.
 
     Args:
@@ -37,9 +40,10 @@ class Wind:
     def __post_init__(self) -> None:
         # copies: an array that the caller writes to again is not this wind
         keep = functools.partial(object.__setattr__, self)
-        velocity = checked_vectors("wind velocity", self.velocity)
+        velocity: Any = checked_vectors("wind velocity", self.velocity)
         if isinstance(velocity, np.ndarray):
             velocity = tuple(velocity.tolist() if velocity.ndim == 1 else map(tuple, velocity.tolist()))
+        warn_of_speed(velocity)
         keep("velocity", velocity)
         keep("density", real("wind density", self.density, least=0.0))
         keep("drag", real("wind drag", self.drag, least=0.0))
@@ -116,6 +120,7 @@ class Scene(Fixed):
         self.contact = Contact() if contact is None else contact
         self.contact.check_obstacles(self.obstacles)
         self.terms = self._terms(terms)
+        warn_of_acceleration(self.gravity)
         self._fix(
             cloth=self.cloth,
             gravity=self.gravity,
@@ -147,11 +152,6 @@ class Scene(Fixed):
         return self.contact.method == "impact-zones" and (bool(self.obstacles) or self.self_contact)
 
     @property
-    def has_gusts(self) -> bool:
-        """Tells whether the wind is another one at each node."""
-        return "wind" in self.functions and kind_of("wind", self.functions["wind"]) != "time"
-
-    @property
     def parameters(self) -> dict[str, Any]:
         """Parameters of registered terms that were given, the argument that would give these; a copy."""
         return dict(self._parameters)
@@ -171,23 +171,19 @@ class Scene(Fixed):
     @property
     def forces(self) -> dict[int, Any]:
         """Forces on nodes [N]: {node: 3 numbers, or steps × 3, or a function}, the argument that would give these."""
-        result = {}
+        result: dict[int, Any] = {}
         for k, node in enumerate(self.force_nodes.tolist()):
             path = self.force_path[:, k]
-            if node in self.functions:
-                result[node] = self.functions[node]
-                continue
             result[node] = path[-1] if (path == path[-1]).all() else path[:-1]
-        return result
+        return result | {node: function for node, function in self.functions.items() if isinstance(node, int)}
 
     def same_as(self, other: Scene) -> bool:
         """Tells whether another one asks for the same motion."""
 
         def values(scene: Scene) -> list[np.ndarray]:
             missing = np.zeros(0)
-            gravity = None if callable(scene.gravity) else scene.gravity
-            arrays = [gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
-            return [missing if array is None else array for array in arrays]
+            arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
+            return [missing if array is None or callable(array) else array for array in arrays]
 
         names = (
             "wind",
@@ -266,8 +262,12 @@ def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> A
 
 def _functions(gravity: Any, wind: Wind | None, forces: dict[int, Any]) -> dict[str | int, Callable]:
     """Collects what is given by functions: "gravity", "wind", and nodes of forces."""
-    given = {"gravity": gravity, "wind": None if wind is None else wind.velocity, **forces}
-    return {name: value for name, value in given.items() if callable(value)}
+    given: list[tuple[str | int, Any]] = [
+        ("gravity", gravity),
+        ("wind", None if wind is None else wind.velocity),
+        *forces.items(),
+    ]
+    return {name: value for name, value in given if callable(value)}
 
 
 def _checked_forces(forces: Any) -> dict[int, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -59,3 +59,8 @@ def of_time(name: str, value: Any) -> Any:
     if callable(value) and kind_of(name, value) != "time":
         raise InputError(f"{name} is a function of place, must be one of time, or numbers")
     return value
+
+
+def has_gusts(functions: Mapping[Any, Callable]) -> bool:
+    """Tells whether the wind of a scene with these functions is another one at each node."""
+    return "wind" in functions and kind_of("wind velocity", functions["wind"]) != "time"

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, integer
+from .fixed import Fixed
 
 
-class Weave:
+class Weave(Fixed):
     """The draft of a cloth of rows × columns crossing nodes.
 
     Args:
@@ -33,8 +34,8 @@ class Weave:
             )
         self.flipped = np.zeros_like(flipped)
         self.flipped[1:-1, 1:-1] = flipped[1:-1, 1:-1]
-        self.flipped.setflags(write=False)
         self.name = name
+        self._fix(draft=self.flipped, name=name)
 
     @property
     def rows(self) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..description.scene import Scene
+from ..description.varying import has_gusts
 from ..kernels import Term, Variant, own
 
 
@@ -57,7 +58,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "has wind": scene.wind is not None,
         "gravity changes": isinstance(scene.gravity, np.ndarray) and scene.gravity.ndim == 2,
         "wind changes": scene.wind is not None and np.ndim(scene.wind.velocity) == 2,
-        "gusts": scene.has_gusts,
+        "gusts": has_gusts(scene.functions),
         "has pins": len(scene.pins) > 0,
         "hard pins": len(scene.pins) > 0 and scene.pin_stiffness is None,
         "spring pins": len(scene.pins) > 0 and scene.pin_stiffness is not None,

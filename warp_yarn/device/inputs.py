@@ -35,7 +35,7 @@ class Inputs:
         self.gravity_varies = hooked or "gravity" in self.functions or "gravity" in self._rows
         """Whether its energy is not the cloth's own: it does work then."""
         self._gusts = None
-        on_device = scene.has_gusts and kind_of("wind velocity", self.functions["wind"]) == "device"
+        on_device = "gusts" in a.conditions and kind_of("wind velocity", self.functions["wind"]) == "device"
         if on_device and not a.variant.reverse:
             self._gusts = gusts.define(a.variant, self.functions.pop("wind"))
         self.hooked = hooked
@@ -48,15 +48,15 @@ class Inputs:
 
     def evaluate(self, step: int, position: np.ndarray) -> None:
         """Puts what functions say in the step after so many others in place, of positions at its beginning."""
-        a, scene = self.model.arrays, self.model.scene
+        a = self.model.arrays
         time = (step + 0.5) * self.model.step_size
         for name, function in self.functions.items():
             if name == "gravity":
                 a["gravity"].assign(evaluated("gravity", function, time, position)[None])
             elif name == "wind":
-                array = "gust" if scene.has_gusts else "wind_velocity"
+                array = "gust" if "gusts" in a.conditions else "wind_velocity"
                 a[array].assign(evaluated("wind velocity", function, time, position).reshape(-1, 3))
-            else:
+            elif isinstance(name, int):
                 self.put("applied_force", evaluated(f"forces[{name}]", function, time, position), node=name)
 
     def put(self, name: str, value: np.ndarray, *, first: int = 0, node: int | None = None) -> None:

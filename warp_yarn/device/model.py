@@ -8,11 +8,11 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
+from ..description.varying import has_gusts
 from ..errors import InputError, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build
 from . import defaults
@@ -39,8 +39,7 @@ class Model:
 
     Args:
         scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations, threads,
-            differentiable: as of the Simulator.
-        hooked: whether it has a hook.
+            differentiable: as of the Simulator; hooked: whether it has a hook.
 
     Attributes:
         arrays: by the names that kernels use.
@@ -210,23 +209,6 @@ class Model:
         options = {} if self.preconditioner == "jacobi" else {"thread": thread}
         self.launch(kernel, 1, most_iterations=self.max_iterations, **options, **arrays)
 
-    def subtract_product(self) -> None:
-        """Take A w, of the solution, off the right-hand side."""
-        a = self.arrays
-        a.zero("q_x", "q_s")
-        self.launch("apply_matrix", 1, p_x=a["solution"], p_s=a["euler_solution"])
-        for name, product in (("rhs", "q_x"), ("euler_rhs", "q_s")):
-            if a[name] is not None:
-                a[name].assign(a[name].numpy() - a[product].numpy())
-
-    @property
-    def held(self) -> np.ndarray:
-        """Which coordinates do not move by forces [nodes, 5]: x of exact pins."""
-        result = np.zeros((self.scene.cloth.nodes, 5), dtype=bool)
-        if self.has_hard_pins:
-            result[self.scene.pins, :3] = True
-        return result
-
     def update_anchor(self, euler: str, anchor: str) -> None:
         """Moves friction's anchors to where the step leaves them, from and into the arrays of these names."""
         a = self.arrays
@@ -268,7 +250,7 @@ def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
     for name in scene.terms:
         choice("scene.terms", name, TERMS)
     kernels = build(variant, scene.terms)
-    if scene.has_gusts:
+    if has_gusts(scene.functions):
         gusty = {name.removeprefix("gusty_"): name for name in kernels if name.startswith("gusty_")}
         kernels = kernels | {name: kernels[other] for name, other in gusty.items()}
     return kernels

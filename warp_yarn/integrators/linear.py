@@ -9,7 +9,7 @@ import warp as wp
 from ..device import declarations
 from ..device.graphs import GraphCache
 from ..device.model import BETWEEN, MATRIX, Model
-from .made import Made, Point
+from .made import Made, Point, subtract_product
 
 
 class LinearlyImplicitEuler:
@@ -68,7 +68,7 @@ class LinearlyImplicitEuler:
         """Assembles what is left of a solve that was made: b − A w, in place of the right-hand side."""
         self.model.arrays.zero("evaluations")
         self._assemble_stage(stage)
-        self.model.subtract_product()
+        subtract_product(self.model)
 
     def _assemble_stage(self, stage: int) -> None:
         self.model.assemble()

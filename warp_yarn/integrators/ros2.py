@@ -10,7 +10,7 @@ from ..device import declarations
 from ..device.model import BETWEEN, MATRIX, Model
 from ..kernels.stepping.ros2 import GAMMA
 from .linear import LinearlyImplicitEuler
-from .made import Made, Point
+from .made import Made, Point, held
 
 
 class ROS2(LinearlyImplicitEuler):
@@ -91,9 +91,10 @@ class ROS2(LinearlyImplicitEuler):
         size, v = GAMMA * step, before.velocity
         mean = (after.position - before.position) / step
         both = (after.velocity - mean) * (2.0 * GAMMA / (1.0 - GAMMA))
-        both[self.model.held] = 0.0
+        fixed = held(self.model)
+        both[fixed] = 0.0
         first = mean - 0.5 * both
-        first[self.model.held] = after.velocity[self.model.held]
+        first[fixed] = after.velocity[fixed]
         second = v + (first - v) / GAMMA
         increment = second - 4.0 * first + 2.0 * v
         return [

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from ..device import declarations
 from ..device.graphs import GraphCache
 from ..device.model import Model
-from .made import Made, Point
+from .made import Made, Point, held
 from .newton import Newton
 from .stage_adjoint import StageAdjoint
 
@@ -128,8 +128,8 @@ class StageMethod:
             return [Made.implicit(1.0, stage, before, after.velocity)]
         first = (after.position - before.position - stage * after.velocity) / carried
         # what is held has one velocity in both
-        held = self.model.held
-        first[held] = after.velocity[held]
+        fixed = held(self.model)
+        first[fixed] = after.velocity[fixed]
         base = Point(before.position + carried * first, before.velocity + rate * (first - before.velocity))
         return [
             Made.implicit(self._shares[0], stage, before, first),

@@ -8,16 +8,26 @@ from typing import Any
 import numpy as np
 
 from ..device.model import Model
-from ..errors import InputError, finite_array
+from ..errors import InputError, NoAttributeError, finite_array
 from .alone import alone
 from .inspection import Inspection
 from .reactions import Steps, reactions, work
 from .relaxation import Relaxation, Relaxed
 from .state import Trajectory
 
+FIXED = ("scene", "step_size", "step_error", "chunk")
+"""Attributes that a simulator has taken into its arrays when it was made."""
+
 
 class Loads(Inspection):
     """Reads what holds the cloth and moves it. A base of the simulator."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in FIXED and name in vars(self):
+            raise NoAttributeError(
+                f"simulator.{name} cannot be set: its arrays are made; make another Simulator, and give it the state"
+            )
+        super().__setattr__(name, value)
 
     @alone
     def reactions(self, trajectory: Trajectory | None = None) -> np.ndarray:

@@ -6,22 +6,42 @@ does, and assembled once more. What is left of a stage's equation at an exact pi
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from ..device.declarations import FRAMES
 from ..errors import InputError, WarpYarnWarning
 from ..integrators.made import Made, Point
 from .inspection import Visit
 from .state import State, Trajectory
-from .stepper import Part, Stepper
+from .stepper import LEDGER, Stepper
 
 GIVES_WAY = 0.01
 """Of the way that a pin was moved: from where on a spring that falls short by so much turns what a test reads."""
-REMADE = 1e-3
-"""Of a spacing: how far a step in parts that is made again may end from where it did."""
+REMADE = 1e-4
+"""Of the cloth's size: how far a step in parts that is made again may end from where it did."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of a step, or all of one.
+
+    Args:
+        method: that made it.
+        size: of the step.
+        left: part of the step that was left when it began.
+        before, after: the states at its ends.
+    """
+
+    method: Any
+    size: float
+    left: float
+    before: State
+    after: State
 
 
 class Steps:
@@ -83,10 +103,10 @@ class Steps:
         if stepper.substepping.allowed is None and step not in stepper.split_steps:
             return [Part(stepper.integrator, 1.0, 1.0, self.frames[k], self.frames[k + 1])]
         ways = [(False, 0.5), (True, 1.0)] if stepper.substepping.allowed is None else [(False, 1.0)]
-        near = stepper.substepping.allowed or REMADE * self.model.scene.cloth.spacing
+        near = stepper.substepping.allowed or REMADE * float(np.ptp(self.frames[k].position, axis=0).max())
         for gained, size in ways[:: -1 if step in stepper.damped_steps else 1]:
             with self.visit(k, self.frames[k]):
-                parts = stepper.remade(gained=gained, size=size)
+                parts = remade(stepper, gained=gained, size=size)
             if parts and np.abs(parts[-1].after.position - self.frames[k + 1].position).max() <= near:
                 return parts
         if not self._warned:
@@ -135,6 +155,40 @@ def _point(state: State) -> Point:
     )
 
 
+def remade(stepper: Stepper, *, gained: bool, size: float) -> list[Part]:
+    """Makes a step in parts again, from the present state, and leaves no trace but that state.
+
+    Args:
+        gained: whether it gained energy when made at once.
+        size: of the first part, in steps.
+
+    Returns:
+        Its parts; none where one cannot be made.
+    """
+    a, parts, frames = stepper.arrays, stepper.substepping, stepper.frames
+    found: list[Part] = []
+    at = [frames.state()]
+
+    def look(method: Any, size: float, left: float) -> None:
+        found.append(Part(method, size, left, at[-1], frames.state()))
+        at.append(found[-1].after)
+
+    frame, row = (int(value) for value in a["counters"].numpy())
+    kept = {name: a[name].numpy().copy() for name in (*LEDGER, *FRAMES) if a.get(name) is not None}
+    counts, watcher = parts.counts, parts.watcher
+    stepper.model.energy.forget()
+    a.put("status", 0, 0, 0)
+    parts.next_size, parts.watcher = size, look
+    try:
+        made = parts.make(lambda: a.put("counters", frame, row), gained=gained)
+    finally:
+        parts.counts, parts.watcher = counts, watcher
+        a.put("status", 0, 0, 0)
+        for name, value in kept.items():
+            a[name].assign(value)
+    return found if made else []
+
+
 def reactions(steps: Steps) -> np.ndarray:
     """Computes what pins give in each step: the impulse of the step over h [steps, pins, 3] (N)."""
     model = steps.model
@@ -164,7 +218,7 @@ def reactions(steps: Steps) -> np.ndarray:
 def _warn_where_springs_give_way(steps: Steps, forces: np.ndarray) -> None:
     """Warns where springs keep pins from where they were moved, so that the cloth is strained less than was asked."""
     scene = steps.model.scene
-    if scene.pin_path is None or not len(forces):
+    if scene.pin_path is None or scene.pin_stiffness is None or not len(forces):
         return
     row = min(steps.start + len(forces), len(scene.pin_path)) - 1
     way = np.linalg.norm(scene.pin_path[row] - scene.cloth.position[scene.pins], axis=1).max()

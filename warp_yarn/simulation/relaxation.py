@@ -15,6 +15,7 @@ from ..device.exclusive import ALONE
 from ..device.model import Model
 from ..errors import InputError, SimulationError, integer, real
 from ..integrators.implicit_euler import ImplicitEuler
+from ..integrators.made import held
 from ..kernels.core.status import CROWDED
 from .state import FIELDS, State
 from .stepper import Stepper
@@ -64,7 +65,7 @@ class Relaxation:
         if self.model.contact.obstacles_move:
             raise InputError("an obstacle moves along its path, must stand still: replace the scene's obstacles")
         crossing = np.repeat(self.model.scene.cloth.topology.is_crossing[:, None] != 0, 2, axis=1)
-        self.free = np.column_stack([np.ones((len(crossing), 3), dtype=bool), crossing]) & ~self.model.held
+        self.free = np.column_stack([np.ones((len(crossing), 3), dtype=bool), crossing]) & ~held(self.model)
 
     def find(self) -> Relaxed:
         """Finds the equilibrium, and makes it the simulator's state."""
@@ -94,11 +95,11 @@ class Relaxation:
     def _steps(self, method: ImplicitEuler, start: State) -> Relaxed:
         """Makes steps until the residual is small."""
         model, size = self.model, self.model.step_size
-        held = len(model.scene.pins) or model.contact.obstacles
+        is_held = len(model.scene.pins) or model.contact.obstacles
         state = self._still(start)
         self._begin(method, size)
         forces = self._forces()
-        if not held and (total := np.linalg.norm(forces[:, :3].sum(axis=0))) > self.allowed:
+        if not is_held and (total := np.linalg.norm(forces[:, :3].sum(axis=0))) > self.allowed:
             raise InputError(
                 f"nothing holds the cloth, no pin and no obstacle, and {total:.3g} N move it as a whole: it has no "
                 "equilibrium; pin a node, or leave out gravity, wind and forces that do not cancel"

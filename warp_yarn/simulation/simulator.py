@@ -27,8 +27,10 @@ from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
 
-BESIDE_TERMS = ("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path")
-BESIDE_TERMS += ("gravity_path", "wind_velocity_path")
+BESIDE_TERMS = (
+    *("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path"),
+    *("gravity_path", "wind_velocity_path"),
+)
 """Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
 
 
@@ -79,7 +81,7 @@ class Simulator(Loads):
             stages tell its error. None: steps are made at once.
         energy_watch: whether a step that gains energy from nowhere is made again, and ends the run where that does not
             help (``docs/solver.md``). False is for who wants a method as it is, such as the paper's eq. 2.
-        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
+        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64; 1 with a hook.
         differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
         hook: called with the simulator before each step, in whatever way it is run; it may read all and ``set_inputs``.
 
@@ -87,8 +89,7 @@ class Simulator(Loads):
         state: the present state, as a copy; set it to start from another one. ``steps_done`` stays as it is then.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up; set it where a
             state is one that was saved after so many steps.
-        trajectory: the frames of the last run, where an exception ended it, as long as the state is the last of them;
-            else None.
+        trajectory: the frames of the last run where an exception ended it and the state is the last of them, or None.
         split_steps: which of the steps since the beginning could not be made at once by the method, and their smallest
             part [s].
         damped_steps: those of them that gained energy, so that a method which damps made them, or parts of them.
@@ -124,12 +125,10 @@ class Simulator(Loads):
         self.lock = threading.RLock()
         """Held while one thread uses the simulator; before ``exclusive.ALONE`` where both are."""
         with ALONE, compiling():
-            self.stepper = _made(scene, **self._options)
-            self.stepper.before_step = None if hook is None else lambda: hook(self)
+            self.stepper = _made(self, scene, **self._options)
             self.scene, self.model, self.integrator = scene, self.stepper.model, self.stepper.integrator
             self.arrays, self.substepping = self.model.arrays, self.stepper.substepping
-            self.step_size = self.model.step_size
-            self.chunk = self.stepper.frames.chunk
+            self.step_size, self.chunk = self.model.step_size, self.stepper.frames.chunk
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
         self.check_clear()
@@ -247,6 +246,7 @@ class Simulator(Loads):
 
 
 def _made(
+    simulator: Simulator,
     scene: Scene,
     *,
     integrator: str,
@@ -279,7 +279,9 @@ def _made(
     frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes, one=hooked or bool(model.inputs.functions)))
     # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
     frames.upload(frames.rest())
-    return Stepper(model, at_once, substepping, frames)
+    stepper = Stepper(model, at_once, substepping, frames)
+    stepper.before_step = None if hook is None else lambda: hook(simulator)
+    return stepper
 
 
 def _rebuilt(

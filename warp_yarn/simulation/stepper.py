@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ..device.declarations import FRAMES
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from ..device.graphs import GraphCache
 from ..device.model import Model
@@ -17,6 +16,7 @@ from ..errors import InputError
 from ..kernels.core.status import CROWDED, GAINED, IMPACT
 from .checks import LARGEST
 from .frames import Frames
+from .hooks import prepare
 from .state import State
 from .substepping import Substepping
 
@@ -39,27 +39,8 @@ class _StepInParts:
     ledger: dict[str, np.ndarray]
 
 
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """A part of a step, or all of one.
-
-    Args:
-        method: that made it.
-        size: of the step.
-        left: part of the step that was left when it began.
-        before, after: the states at its ends.
-    """
-
-    method: Any
-    size: float
-    left: float
-    before: State
-    after: State
-
-
 class Stepper:
     """Makes steps. An exception may come between any two of its operations: ``settle`` comes before the next call.
-
     Whoever calls it holds the simulator's lock.
 
     Args:
@@ -127,8 +108,7 @@ class Stepper:
             self._owed = None
 
     def settle(self) -> None:
-        """Finishes or takes back what an exception left half done. It may come again meanwhile: then this begins
-        anew."""
+        """Finishes or takes back what an exception left half done; after another one meanwhile it begins anew."""
         self._end_team()
         if self._chunk is not None:
             self._close_chunk(self._chunk, self._frames_made())
@@ -167,8 +147,7 @@ class Stepper:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
         try:
-            if self.before_step is not None or self.model.inputs.functions:
-                self._prepare()
+            prepare(self)
             with ALONE, compiling():
                 refuse_recording(self.model.device)
                 self.settle()
@@ -177,29 +156,6 @@ class Stepper:
             return self._make_steps(steps)
         finally:
             self._end_team()
-
-    def _prepare(self) -> None:
-        """Lets a hook and functions set the inputs of the next step; a chunk is one step then.
-
-        Raises:
-            InputError: a hook that moved the simulator on, or elsewhere.
-        """
-        with ALONE:
-            self.settle()
-        if self.before_step is not None:
-            before = self._fixed()
-            self.before_step()
-            if self._fixed() != before:
-                raise InputError("a hook made steps or set the state, may read it and set inputs")
-        if self.model.inputs.functions:
-            with ALONE, compiling():
-                self.settle()
-                self.model.inputs.evaluate(self.steps_done, self.frames.state().position)
-
-    def _fixed(self) -> tuple[Any, ...]:
-        """Gives what a hook may not change: the steps that were made, and the frames that are kept."""
-        recording = self.frames.recording
-        return self.steps_done, self.frames.filled, recording, recording is not None and recording.open
 
     def _make_steps(self, steps: int) -> int:
         base = self.steps_done
@@ -268,7 +224,6 @@ class Stepper:
                 self._step_in_parts = None
                 return True
         if whole:
-            # it could not be made at once
             gained = parts.can_damp and self._status() in (GAINED, IMPACT)
             self.frames.restore(frame)
             self.arrays.put("status", 0, 0, 0)
@@ -284,36 +239,3 @@ class Stepper:
             self.damped_steps.add(self.steps_done + frame + 1)
         self._step_in_parts = None
         return True
-
-    def remade(self, *, gained: bool, size: float) -> list[Part]:
-        """Makes a step in parts again, from the present state, and leaves no trace but that state.
-
-        Args:
-            gained: whether it gained energy when made at once.
-            size: of the first part, in steps.
-
-        Returns:
-            Its parts; none where one cannot be made.
-        """
-        a, parts, frames = self.arrays, self.substepping, self.frames
-        found: list[Part] = []
-        at = [frames.state()]
-
-        def look(method: Any, size: float, left: float) -> None:
-            found.append(Part(method, size, left, at[-1], frames.state()))
-            at.append(found[-1].after)
-
-        frame, row = (int(value) for value in a["counters"].numpy())
-        kept = {name: a[name].numpy().copy() for name in (*LEDGER, *FRAMES) if a.get(name) is not None}
-        counts, watcher = parts.counts, parts.watcher
-        self.model.energy.forget()
-        a.put("status", 0, 0, 0)
-        parts.next_size, parts.watcher = size, look
-        try:
-            made = parts.make(lambda: a.put("counters", frame, row), gained=gained)
-        finally:
-            parts.counts, parts.watcher = counts, watcher
-            a.put("status", 0, 0, 0)
-            for name, value in kept.items():
-                a[name].assign(value)
-        return found if made else []
