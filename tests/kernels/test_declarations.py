@@ -18,7 +18,9 @@ STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAd
 STRUCTS |= {"Pairs", "Obstacles", "Faces"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
-"""Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""
+STAND_INS |= {"gravity_path", "wind_velocity_path", "origin"}
+"""Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint; and what the kernel of a
+user's gusts takes."""
 
 
 def arguments(variant: Variant) -> list[tuple[str, str, object]]:

@@ -114,7 +114,8 @@ class EnergyWatch:
         self.model.contact.add_power()
 
     def power_of(self, name: str) -> float:
-        """Compute the power at the present state of a term that does work, or of moving obstacles, "contact" [W]."""
+        """Compute the power of a term that does work, at the present state along the solution, or of moving obstacles,
+        "contact" [W]."""
         a = self.model.arrays
         a.zero("power")
         if name == "contact":
@@ -124,7 +125,7 @@ class EnergyWatch:
         term = next(term for term in self._outer if term.name == name)
         a.zero("q_x", "q_s")
         self.model.launch_term(term, matrix=0, add_contact_load=0, force=a["q_x"], euler_force=a["q_s"])
-        pairs = [("q_x", "velocity"), *([("q_s", "euler_velocity")] if self.model.scene.sliding else [])]
+        pairs = [("q_x", "solution"), *([("q_s", "euler_solution")] if self.model.scene.sliding else [])]
         return sum(float(np.vdot(*(a[name].numpy().astype(np.float64) for name in pair))) for pair in pairs)
 
     @property

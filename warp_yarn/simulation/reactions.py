@@ -125,7 +125,7 @@ class Steps:
         for part in parts:
             found = part.method.made(_point(part.before), _point(part.after), part.size * h)
             if ends and any(made.ahead for made in found):
-                found = _ends(part)
+                found = _ends(part, part.size * h)
             with self.visit(k, part.before):
                 part.method.set_times(part.size * h, part.left * h)
                 for stage, made in enumerate(found):
@@ -220,12 +220,12 @@ def _warn_where_springs_give_way(steps: Steps, forces: np.ndarray) -> None:
     scene = steps.model.scene
     if scene.pin_path is None or scene.pin_stiffness is None or not len(forces):
         return
-    row = min(steps.start + len(forces), len(scene.pin_path)) - 1
-    way = np.linalg.norm(scene.pin_path[row] - scene.cloth.position[scene.pins], axis=1).max()
+    # all of it: at the beginning of a path any force is much beside the way
+    way = np.linalg.norm(scene.pin_path - scene.cloth.position[scene.pins], axis=2).max()
     short = float(np.nanmax(np.linalg.norm(forces[-1], axis=1), initial=0.0)) / scene.pin_stiffness
     if short > GIVES_WAY * way:
         warnings.warn(
-            f"pins give way by {short:.2g} m, {100.0 * short / way if way else np.inf:.2g} % of the way that they were "
+            f"pins give way by {short:.2g} m, {100.0 * short / way if way else np.inf:.2g} % of the way that they are "
             f"moved: pin_stiffness = {scene.pin_stiffness:g} N/m is soft for this cloth, and what it reads is too "
             "little; make the scene with pin_stiffness=None, which holds exactly",
             WarpYarnWarning,
@@ -251,10 +251,12 @@ def work(steps: Steps) -> dict[str, np.ndarray]:
     return result
 
 
-def _ends(part: Part) -> list[Made]:
-    """Gives both ends of a part, to look at powers where its stages are not where it led."""
-    ends = (_point(part.before), _point(part.after))
-    return [Made(0.5, 1.0, *end, end.velocity, None, 0.0) for end in ends]
+def _ends(part: Part, duration: float) -> list[Made]:
+    """Gives both ends of a part, to look at powers along the way between them where its stages are not where it
+    led."""
+    before, after = _point(part.before), _point(part.after)
+    way = (after.position - before.position) / duration
+    return [Made(0.5, duration, *end, way, None, 0.0) for end in (before, after)]
 
 
 def _pin_motion(steps: Steps) -> np.ndarray:

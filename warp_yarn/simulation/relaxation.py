@@ -26,10 +26,12 @@ LONGEST, SHORTEST = 1e9, 1e-6
 """η, in steps of the simulator: the damping of sliding, which acts by rates, is to vanish beside stiffness."""
 STILL = 1e-3
 """Of a node's mean weight: the force that is left by default."""
+ROUGH = 0.1
+"""Of it: what rounding may leave at most where nothing is said."""
 GONE = 10.0
 """Times the size of the cloth: how far it may move as a whole before nothing holds it."""
-EPSILON = {"double": 1e-15, "single": 1e-6}
-"""Of positions, ten times their rounding."""
+EPSILON = {"double": 1e-15, "single": 1e-7}
+"""Of positions: their rounding, with room in double precision."""
 
 
 class Relaxed(NamedTuple):
@@ -96,7 +98,7 @@ class Relaxation:
         """Makes steps until the residual is small."""
         model, size = self.model, self.model.step_size
         is_held = len(model.scene.pins) or model.contact.obstacles
-        state = self._still(start)
+        state = self._still(self.frames.state())
         self._begin(method, size)
         forces = self._forces()
         if not is_held and (total := np.linalg.norm(forces[:, :3].sum(axis=0))) > self.allowed:
@@ -195,5 +197,13 @@ def _default(model: Model) -> float:
     """Gives the force to end with: a part of a node's weight, but what rounding of positions leaves at least."""
     cloth = model.scene.cloth
     extent = np.abs(cloth.position - model.arrays.origin).max()
-    rounding = EPSILON[model.precision] * extent * cloth.stretch_stiffness.max() / cloth.spacing
-    return max(STILL * 9.8 * model.arrays.node_mass(), float(rounding))
+    a, b = cloth.topology.segment_nodes.T
+    shortest = np.abs(cloth.euler[b] - cloth.euler[a]).max(axis=1).min()
+    rounding = float(EPSILON[model.precision] * extent * cloth.stretch_stiffness.max() / shortest)
+    weight = 9.8 * model.arrays.node_mass()
+    if rounding > ROUGH * weight:
+        raise InputError(
+            f"residual = None, must be given here: positions in {model.precision} precision leave forces of some "
+            f"{rounding:.2g} N, a node weighs {weight:.2g} N; precision='double' comes nearer"
+        )
+    return max(STILL * weight, rounding)

@@ -128,7 +128,7 @@ class Simulator(Loads):
             self.stepper = _made(self, scene, **self._options)
             self.scene, self.model, self.integrator = scene, self.stepper.model, self.stepper.integrator
             self.arrays, self.substepping = self.model.arrays, self.stepper.substepping
-            self.step_size, self.chunk = self.model.step_size, self.stepper.frames.chunk
+            self.chunk, self.step_size = self.stepper.frames.chunk, self.model.step_size
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
         self.check_clear()
