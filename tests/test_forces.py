@@ -142,7 +142,7 @@ NAMES = ("position", "euler", "velocity", "euler_velocity", "anchor")
 
 
 def strip(stiffness: float | None) -> tuple[wy.Simulator, float]:
-    """A strip of cotton that is pulled by 2 % of its length, and what that takes: k_s times the strain, of each yarn."""
+    """A strip of cotton that is pulled by 2 % of its length, and what that takes: k_s times the strain of each yarn."""
     cloth = wy.fabrics.cotton(rows=9, columns=4, pose="flat")
     ends = [cloth.node(row, i) for row in (0, -1) for i in range(4)]
     length = 8 * cloth.spacing
@@ -275,7 +275,7 @@ def test_frames_of_another_run_are_refused():
         simulator.reactions(3)
     with pytest.raises(wy.InputError, match=r"trajectory.step = 0.001, must be 0.002"):
         wy.Simulator(moved(None), step=2e-3).reactions(trajectory)
-    with pytest.raises(wy.InputError, match="trajectory.cloth is another one"):
+    with pytest.raises(wy.InputError, match=r"trajectory\.cloth is another one"):
         wy.Simulator(moved(None, fabric=wy.fabrics.cotton)).reactions(trajectory)
 
 
