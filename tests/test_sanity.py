@@ -2,6 +2,7 @@
 so."""
 
 import pickle
+import re
 import warnings
 
 import numpy as np
@@ -63,9 +64,7 @@ def test_another_unit_is_warned_of(name):
         warnings.simplefilter("always")
         make()
     assert all(issubclass(warning.category, wy.WarpYarnWarning) for warning in caught)
-    with pytest.warns(wy.WarpYarnWarning, match=message):
-        for warning in caught:
-            warnings.warn(warning.message, stacklevel=1)
+    assert any(re.search(message, str(warning.message)) for warning in caught)
 
 
 def test_a_warning_names_the_line_that_made_it():
@@ -82,10 +81,10 @@ THINGS = {
     "wind": (lambda: wy.Wind(velocity=(0, 1, 0)), "velocity", (0.0, 2.0, 0.0)),
     "contact": (wy.Contact, "friction", 0.1),
     "plane": (lambda: wy.Plane(**PLANE), "friction", 0.1),
-    "sphere": (lambda: wy.Sphere(center=(0, 0, 0), radius=1.0), "radius", 2.0),
-    "capsule": (lambda: wy.Capsule(start=(0, 0, 0), end=(1, 0, 0), radius=1.0), "radius", 2.0),
-    "cylinder": (lambda: wy.Cylinder(start=(0, 0, 0), end=(1, 0, 0), radius=1.0), "radius", 2.0),
-    "box": (lambda: wy.Box(center=(0, 0, 0), size=(1, 1, 1)), "friction", 0.1),
+    "sphere": (lambda: wy.Sphere(center=(0, 0, 0), radius=1.0), "friction", 0.1),
+    "capsule": (lambda: wy.Capsule(start=(0, 0, 0), end=(1, 0, 0), radius=1.0), "friction", 0.1),
+    "cylinder": (lambda: wy.Cylinder(start=(0, 0, 0), end=(1, 0, 0), radius=1.0), "friction", 0.1),
+    "box": (lambda: wy.Box(center=(0, 0, 0), half_extents=(1, 1, 1)), "friction", 0.1),
     "scene": (lambda: wy.Scene(wy.paper.cloth(rows=4, columns=4)), "gravity", None),
 }
 

@@ -2,15 +2,18 @@
 
 import copy
 import pickle
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
 from inputs import EXACT
+from internals import halved
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
+from warp_yarn.calibration.problem import with_paths
 from warp_yarn.integrators import INTEGRATORS
 
 STEPS, STEP = 8, 1e-3
@@ -377,6 +380,22 @@ def test_a_jump_of_gravity_is_no_gain_of_energy():
 def test_what_cannot_be_used_is_refused(make, message):
     with pytest.raises(wy.InputError, match=message):
         make()
+
+
+def test_rows_in_steps_of_another_length():
+    """Learning's: means over the model's step, of two and a half rows; ablation's: each row twice."""
+    values = rows(falling, 4)
+    given = scene(gravity=values, wind=wy.Wind(velocity=values))
+    longer = with_paths(given, given.cloth.position[given.pins], 0, Fraction(5, 2), 2)
+    means = [(values[0] + values[1] + 0.5 * values[2]) / 2.5, (0.5 * values[2] + 2.0 * values[3]) / 2.5]
+    np.testing.assert_allclose(longer.gravity, means, rtol=1e-14)
+    np.testing.assert_allclose(longer.wind.velocity, means, rtol=1e-14)
+    for half in (halved(given, None), halved(scene(forces={3: falling}, wind=wy.Wind(velocity=falling)), None)):
+        if half.functions:
+            assert half.functions == {"wind": falling, 3: falling}
+        else:
+            np.testing.assert_array_equal(half.gravity, np.repeat(values, 2, axis=0))
+            np.testing.assert_array_equal(half.wind.velocity, np.repeat(values, 2, axis=0))
 
 
 # -- recordings --------------------------------------------------------------------------------------------------------
