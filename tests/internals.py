@@ -137,6 +137,10 @@ def left_of_the_last_stage(simulator: wy.Simulator) -> float:
     return np.sqrt(slope) / change / newton_tolerance(simulator, simulator.step_size)
 
 
+def watches_energy(simulator: wy.Simulator) -> bool:
+    return simulator.model.energy.on
+
+
 def fails_at_first(simulator: wy.Simulator, largest: float) -> None:
     """Makes a simulator fail in its first step, wherever it tries more of it at once than so much [s]."""
     advance, arrays = simulator.integrator.advance, simulator.arrays

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from cases import quick
+from internals import watches_energy
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
@@ -188,8 +189,7 @@ def test_a_run_goes_on_as_if_from_that_state():
     second = wy.Simulator(scene)
     second.state, second.steps_done = first.state, first.steps_done
     assert first.run(5) == second.run(5)
-    with_watch = first.model.energy.on
-    assert with_watch
+    assert watches_energy(first)
 
 
 def test_single_precision_ends_where_it_can():
