@@ -338,6 +338,32 @@ def test_inputs_between_runs():
     np.testing.assert_array_equal(copy.copy(simulator).run(2).position, simulator.run(2).position)
 
 
+def test_what_is_set_once_stays():
+    """In every row from the next step on, and in none before."""
+    fabric = cloth()
+    pins = fabric.corners("top")
+    place = fabric.position[pins] + np.array([0.0, 1e-4, 0.0])
+    path = np.repeat(fabric.position[pins][None], 6, axis=0)
+    given = wy.Scene(
+        fabric, pins=pins, pin_path=path, gravity=rows(falling, 6), wind=wy.Wind(velocity=rows(blowing, 6)),
+        forces={13: rows(pulling, 6)},
+    )  # fmt: skip
+    simulator = wy.Simulator(given)
+    first = simulator.run(2)
+    values = np.array([0.0, 2.0, -3.0])
+    simulator.set_inputs(gravity=values, wind=values, forces={13: 1e-5 * values}, pins=place)
+    second = simulator.run(4)
+
+    def changed(before: np.ndarray, value: np.ndarray) -> np.ndarray:
+        return np.concatenate([before[:2], np.broadcast_to(value, (4, *before.shape[1:]))])
+
+    expected = given.replace(
+        pin_path=changed(path, place), gravity=changed(rows(falling, 6), values),
+        wind=wy.Wind(velocity=changed(rows(blowing, 6), values)), forces={13: changed(rows(pulling, 6), 1e-5 * values)},
+    )  # fmt: skip
+    np.testing.assert_array_equal(np.concatenate([first.position, second.position[1:]]), run(expected, 6).position)
+
+
 def test_a_jump_of_gravity_is_no_gain_of_energy():
     """From a tenth of gravity to ten times as much against it, and back, at every step."""
     values = np.tile([[0.0, 0.0, -1.0], [0.0, 0.0, 90.0]], (10, 1))
