@@ -1,0 +1,1 @@
+"""Tasks to learn by control: a cloth that is thrown into a box."""
