@@ -12,7 +12,8 @@ SCALE = 2000.0
 """Pixels a metre."""
 LEFT, HIGHEST = -40e-3, 45e-3
 """x at the left edge, z at the upper edge [m]."""
-BACKGROUND, TABLE, WALLS, FLOOR, YARN = (245, 245, 245), (160, 130, 100), (110, 120, 140), (200, 200, 205), (200, 40, 40)
+BACKGROUND, TABLE, WALLS = (245, 245, 245), (160, 130, 100), (110, 120, 140)
+FLOOR, YARN = (200, 200, 205), (200, 40, 40)
 DOTS = 12
 """Along a yarn from node to node."""
 
@@ -27,10 +28,11 @@ def picture(position: np.ndarray, columns: int, place: np.ndarray) -> np.ndarray
             _fill(view, FLOOR, highest, (LEFT, LEFT + WIDTH / SCALE), (-1.0, box.BOTTOM))
         else:
             view[:] = FLOOR
-        for obstacle, color in zip(box.obstacles(place), (TABLE, None, *[WALLS] * 4), strict=True):
-            if color is not None:
-                low, high = obstacle.position - obstacle.size, obstacle.position + obstacle.size
-                _fill(view, color, highest, (low[0], high[0]), (low[axis], high[axis]))
+        table, _, *walls = box.obstacles(place)
+        # from the side, through the wall in front
+        for obstacle, color in ((table, TABLE), *((wall, WALLS) for wall in walls[: 2 if axis == 2 else 4])):
+            low, high = obstacle.position - obstacle.size, obstacle.position + obstacle.size
+            _fill(view, color, highest, (low[0], high[0]), (low[axis], high[axis]))
         points = _yarns(position, columns)
         row = np.floor((highest - points[:, axis]) * SCALE).astype(int)
         column = np.floor((points[:, 0] - LEFT) * SCALE).astype(int)

@@ -69,8 +69,8 @@ class ThrowIntoBox(gymnasium.Env):
         self.cloth = box.cloth()
         nodes = self.cloth.nodes
         high = np.concatenate([np.full(3 * nodes, FAR), np.full(3 * nodes, FAST), np.full(2, FAR), np.ones(1)])
-        low = np.append(-high[:-1], 0.0)
-        self.observation_space = gymnasium.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+        self._low, self._high = np.append(-high[:-1], 0.0), high
+        self.observation_space = gymnasium.spaces.Box(self._low.astype(np.float32), high.astype(np.float32))
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (12,), np.float32)
         self.simulator = Simulator(box.scene(self.cloth, friction=self.friction), **OPTIONS)
         self._rollouts: dict[str, Any] = {}
@@ -102,9 +102,8 @@ class ThrowIntoBox(gymnasium.Env):
         self.shift = finite_array("shift", given.get("shift", SHIFT * drawn[:2]), (2,))
         self.turn = real("turn", given.get("turn", TURN * drawn[2]))
         self.place = finite_array("place", given.get("place", 0.5 * (low + high + (high - low) * drawn[3:])), (2,))
-        self._put("obstacle_position", box.obstacle_position(self.place))
-        self._put("obstacle_position_before", box.obstacle_position(self.place))
         self.simulator.reset()
+        self.simulator.place_obstacles(box.obstacle_position(self.place))
         self.simulator.state = self._start()
         self._pushed, self._parts = 0, []
         return self._observed(), {}
@@ -118,10 +117,10 @@ class ThrowIntoBox(gymnasium.Env):
         """
         if not 0 <= self._pushed < box.PUSHED:
             raise gymnasium.error.ResetNeeded("the episode is over, or did not begin: call reset() first")
-        forces = box.FORCE * np.clip(finite_array("action", action, self.action_space.shape), -1.0, 1.0)
+        forces = box.FORCE * np.clip(finite_array("action", action, (12,)), -1.0, 1.0)
         path = np.zeros((box.PUSHED + 1, 4, 3))
         path[self._pushed] = forces.reshape(4, 3)
-        self._put("applied_force_path", path.reshape(-1, 3))
+        self.simulator.arrays["applied_force_path"].assign(path.reshape(-1, 3))
         self._pushed += 1
         info: dict[str, Any] = {}
         terminated = truncated = False
@@ -211,12 +210,7 @@ class ThrowIntoBox(gymnasium.Env):
     def _observed(self) -> np.ndarray:
         state, done = self.simulator.state, max(self._pushed, 0) / box.PUSHED
         seen = np.concatenate([state.position.ravel(), state.velocity.ravel(), self.place, [done]])
-        return np.clip(seen, self.observation_space.low, self.observation_space.high).astype(np.float32)
-
-    def _put(self, name: str, value: np.ndarray) -> None:
-        """Puts numbers into an array of the simulator."""
-        origin = self.simulator.arrays.origin if "position" in name else 0.0
-        self.simulator.arrays[name].assign(value - origin)
+        return np.clip(seen, self._low, self._high).astype(np.float32)
 
 
 OPTIONS: dict[str, Any] = {"step": box.STEP, "integrator": box.INTEGRATOR}
