@@ -4,8 +4,8 @@
     python benchmarks/control.py box             figure 8: loss against simulated episodes and seconds, every method
     python benchmarks/control.py variants        what to learn from: which losses lead into the box, and which mislead
 
-Each writes benchmarks/results/control_NAME.csv, and box docs/control.png. PPO's curve is in it where
-benchmarks/results/ppo.csv has one. Needs the extras torch and bench.
+Each writes benchmarks/results/control_NAME.csv, and box docs/control.png. Needs the extras torch and
+bench, and rl for PPO.
 """
 
 from __future__ import annotations
@@ -237,72 +237,100 @@ def bounded(inner: np.ndarray) -> np.ndarray:
     return box.FORCE * np.tanh(inner).reshape(box.PUSHED, 4, 3)
 
 
+def ppo(seed: int, episodes: int) -> Iterator[tuple[int, float, float, bool]]:
+    """PPO of stable-baselines3 on the environment of this scene, reward minus the miss: the mean action's throw."""
+    from reinforcement import EPISODES_OF_PPO, HIDDEN, Scaled
+    from stable_baselines3 import PPO
+
+    from warp_yarn.envs import ThrowIntoBox
+
+    env, test = (Scaled(ThrowIntoBox(random=False)) for _ in range(2))
+    steps = EPISODES_OF_PPO * box.PUSHED
+    size = {"net_arch": [HIDDEN, HIDDEN]}
+    model = PPO("MlpPolicy", env, seed=seed, n_steps=steps, batch_size=64, gamma=1.0, policy_kwargs=size, device="cpu")
+    with torch.no_grad():  # the other methods' start
+        model.policy.action_net.bias.view(4, 3)[:, 2] += math.tanh(throws.LIFT)
+    begin = time.perf_counter()
+    for done in range(EPISODES_OF_PPO, episodes + 1, EPISODES_OF_PPO):
+        model.learn(steps, reset_num_timesteps=False)
+        seen, info = test.reset()[0], {}
+        for _ in range(box.PUSHED):
+            seen, _, _, _, info = test.step(model.predict(seen, deterministic=True)[0])
+        miss, success = info["distance"], info["is_success"]
+        yield done, time.perf_counter() - begin, miss, success
+
+
 METHODS: dict[str, Callable[[int, argparse.Namespace], Iterator[tuple[int, float, float, bool]]]] = {
     "free forces": lambda seed, options: gradient(throws.Forces, seed, options.epochs),
     "network": lambda seed, options: gradient(throws.Network, seed, options.epochs),
     "CMA-ES": lambda seed, options: evolution(seed, options.episodes),
     "random search": lambda seed, options: random_search(seed, options.episodes),
+    "PPO": lambda seed, options: ppo(seed, options.episodes),
 }
 
 
 def into_box(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of every method, seed and point of its curve."""
-    rows = []
+    """Rows of every method, seed and point of its curve; those of methods that are not asked for stay as they were."""
+    rows = [row for row in read(options.output) if row["method"] not in options.methods]
     for name in options.methods:
         for seed in range(options.seeds):
-            last = None
+            successes: list[dict[str, Any]] = []
             for episodes, seconds, miss, success in METHODS[name](seed, options):
                 row = {"method": name, "seed": seed, "episodes": episodes, "seconds": seconds}
                 rows.append({**row, "miss [mm]": 1e3 * miss, "success": int(success)})
-                if success and last is None:
-                    last = rows[-1]
-            print(f"{name}, seed {seed}: first success {last and (last['episodes'], round(last['seconds'], 1))}")
+                successes += [rows[-1]] * bool(success)
+                if len(successes) == LASTING:
+                    break
+            at = "none" if not successes else "after {episodes} episodes, {seconds:.1f} s".format(**successes[0])
+            print(f"{name}, seed {seed}: first success {at}", flush=True)
     return rows
+
+
+LASTING = 3
+"""Successes at which a curve ends."""
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The rows of such a file, if there is one."""
+    if not path.exists():
+        return []
+    kinds = {"method": str, "seed": int, "episodes": int, "seconds": float, "miss [mm]": float, "success": int}
+    with open(path, newline="") as file:
+        return [{name: kind(row[name]) for name, kind in kinds.items()} for row in csv.DictReader(file)]
 
 
 def figure_8(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Loss against episodes and seconds: median of the seeds, spread, and where each first succeeds."""
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     for axes, along in zip(figure.subplots(1, 2, sharey=True), ("episodes", "seconds"), strict=True):
-        for name, color, marker in zip(dict.fromkeys(row["method"] for row in rows), COLORS, MARKERS, strict=False):
+        for name, color, marker in zip(METHODS, COLORS, MARKERS, strict=False):
             mine = [row for row in rows if row["method"] == name]
             curves = [[row for row in mine if row["seed"] == seed] for seed in sorted({row["seed"] for row in mine})]
-            shortest = min(map(len, curves))
-            x = np.median([[row[along] for row in curve[:shortest]] for curve in curves], axis=0)
-            y = np.array([[row["miss [mm]"] for row in curve[:shortest]] for curve in curves])
-            axes.plot(x, np.nanmedian(y, axis=0), color=color, label=name, linewidth=1.6)
-            axes.fill_between(x, np.nanmin(y, axis=0), np.nanmax(y, axis=0), color=color, alpha=0.15, linewidth=0)
+            if not curves:
+                continue
+            grid = np.geomspace(min(row[along] for row in mine), max(row[along] for row in mine), 80)
+            y = np.array([held(curve, along, grid) for curve in curves])
             firsts = [next((row for row in curve if row["success"]), None) for curve in curves]
             done = [row for row in firsts if row is not None]
+            label = f"{name}: {len(done)} of {len(curves)} seeds"
+            axes.plot(grid, np.nanmedian(y, axis=0), color=color, label=label, linewidth=1.6)
+            axes.fill_between(grid, np.nanmin(y, axis=0), np.nanmax(y, axis=0), color=color, alpha=0.15, linewidth=0)
             axes.plot([row[along] for row in done], [row["miss [mm]"] for row in done], marker, color=color, alpha=0.8)
         axes.set_xscale("log")
-        axes.set_xlabel({"episodes": "simulated episodes", "seconds": "seconds, one core"}[along])
-        axes.grid(alpha=0.3, which="both")
+        axes.set_xlabel({"episodes": "simulated episodes", "seconds": "seconds"}[along])
+        axes.grid(alpha=0.3)
         axes.axhline(1e3 * 0.5 * box.INNER, color="0.4", linewidth=1.0, linestyle=":")
     left = figure.axes[0]
-    left.set_ylabel("from the centre to the middle of the box's bottom, at the end [mm]")
-    left.set_ylim(0.0, 140.0)
-    left.legend(loc="upper right", title="median and range of the seeds;\nmarks: first success of each")
+    left.set_ylabel("how far from the box's middle the throw arrives [mm]")
+    left.set_ylim(0.0, None)
+    left.legend(title="median and range of the seeds;\nmarks: first success of each", fontsize="small")
     save(figure, path)
 
 
-def reinforcement(path: Path) -> list[dict[str, Any]]:
-    """PPO's curve, where there is one."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [
-        {
-            "method": "PPO",
-            "seed": int(row["seed"]),
-            "episodes": int(row["episodes"]),
-            "seconds": float(row["seconds"]),
-            "miss [mm]": float(row["miss [mm]"]),
-            "success": int(float(row["success"]) > 0.5),
-        }
-        for row in rows
-    ]
+def held(curve: Sequence[dict[str, Any]], along: str, grid: np.ndarray) -> np.ndarray:
+    """A curve at places of a grid: as it was last."""
+    at = np.searchsorted([row[along] for row in curve], grid, side="right") - 1
+    return np.array([row["miss [mm]"] for row in curve])[np.maximum(at, 0)]
 
 
 # -- what to learn from -----------------------------------------------------------------------------------------------
@@ -320,7 +348,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def variants(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of every variant, with and without an upward start and a bound of the gradient's norm; free forces."""
+    """Rows of every variant, with and without an upward start and a bound of the gradient's norm; free forces. A run ends
+    where it first succeeds."""
     rows = []
     for name, more in VARIANTS.items():
         throw = throws.Throw(**more)
@@ -372,14 +401,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     torch.set_num_threads(1)
-    output = options.output or RESULTS / f"control_{options.what}.csv"
+    options.output = options.output or RESULTS / f"control_{options.what}.csv"
     rows = {"published": published, "box": into_box, "variants": variants}[options.what](options)
-    write_csv(output, rows, environment("torch"))
+    write_csv(options.output, rows, environment("torch"))
     if options.what == "box":
-        figure_8([*rows, *reinforcement(RESULTS / "ppo.csv")], options.plot)
+        figure_8(rows, options.plot)
     else:
         print_table(rows)
-    print("written:", output)
+    print("written:", options.output)
 
 
 if __name__ == "__main__":

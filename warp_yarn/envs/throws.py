@@ -162,7 +162,7 @@ class Epoch:
         loss: that was learned from; NaN: the throw could not be simulated.
         gradient: its norm, before it was bounded.
         forces: [PUSHED, 4, 3] (N).
-        miss: from the centre to the target after the throw in the true scene [m]; NaN as of loss.
+        miss: how far from the box's middle the throw arrives in the true scene [m]; NaN as of loss.
         success: whether it ended inside the box.
         seconds: since the start, judging included.
     """
@@ -228,10 +228,11 @@ def true_throw(forces: np.ndarray, place: Any = box.PLACE) -> Trajectory:
 
 
 def judge(forces: np.ndarray, place: Any = box.PLACE) -> tuple[float, bool]:
-    """Tells how far from the target the throw of these forces ends in the true scene [m], and whether it succeeds."""
+    """Makes the throw of these forces in the true scene, and tells how far from the box's middle it arrives, along x
+    and y [m], and whether it succeeds; NaN where it cannot be simulated."""
     try:
         trajectory = true_throw(forces, place)
     except SimulationError:
         return np.nan, False
-    miss = float(np.linalg.norm(trajectory.position[-1].mean(axis=0) - box.target(place)))
-    return miss, box.success(trajectory.position, trajectory.velocity, place)
+    off = box.arrival(trajectory.position.mean(axis=1)) - box.target(place)
+    return float(np.linalg.norm(off[:2])), box.success(trajectory.position, trajectory.velocity, place)
