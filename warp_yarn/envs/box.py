@@ -14,7 +14,7 @@ import numpy as np
 from ..description.cloth import Cloth
 from ..description.obstacles import Box, Obstacle, Plane
 from ..description.scene import Scene
-from ..errors import choice, finite_array, real
+from ..errors import InputError, choice, finite_array, real
 from ..presets import paper
 
 STEP = 1e-3
@@ -79,8 +79,16 @@ def pose(flat: Cloth, shift: Any, turn: float) -> np.ndarray:
 
 
 def walls(place: Any = PLACE) -> np.ndarray:
-    """Finds the middles of the box's walls [4, 3] (m)."""
+    """Finds the middles of the box's walls [4, 3] (m).
+
+    Raises:
+        InputError: a place where the box would be in the table.
+    """
     x, y = finite_array("place", place, (2,))
+    half = 0.5 * INNER + THICKNESS
+    if abs(x) < TABLE[0] + half and abs(y) < TABLE[1] + half:
+        allowed = f"|x| at least {TABLE[0] + half:g}, or |y| at least {TABLE[1] + half:g}, beside the table"
+        raise InputError(f"place = ({x:g}, {y:g}), must have {allowed}")
     out = 0.5 * (INNER + THICKNESS)
     z = BOTTOM + 0.5 * WALL
     return np.array([[x - out, y, z], [x + out, y, z], [x, y - out, z], [x, y + out, z]])

@@ -6,7 +6,7 @@ import numpy as np
 
 from . import box
 
-WIDTH, SIDE, TOP = 320, 160, 160
+WIDTH, SIDE, TOP = 320, 160, 192
 """Pixels of the picture: its width, and the heights of both views."""
 SCALE = 2000.0
 """Pixels a metre."""

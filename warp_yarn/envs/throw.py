@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +11,14 @@ import numpy as np
 
 from ..errors import InputError, SimulationError, choice, finite_array, real
 from ..simulation.simulator import Simulator
-from ..simulation.state import Trajectory
+from ..simulation.state import State, Trajectory
 from . import box
 from .picture import picture
 
 if TYPE_CHECKING:
     import torch
+
+    from .gradient import Throws
 
 SHIFT, TURN = 5e-3, np.pi / 4.0
 """How far a random start is from the table's middle along x and y, and how far it is turned, at most [m, rad]."""
@@ -25,8 +28,8 @@ FAR, FAST = 1.0, 20.0
 """Bounds of observed positions and velocities [m, m/s]: no throw comes near them."""
 LOOK = 20
 """Steps of a flight between two looks at whether the cloth lies still."""
-PART = 25
-"""Steps of a part of a differentiable throw, after each of which it may have arrived."""
+OPTIONS: dict[str, Any] = {"step": box.STEP, "integrator": box.INTEGRATOR}
+"""Of the simulator, and of throws that have a gradient."""
 
 
 class ThrowIntoBox(gymnasium.Env):
@@ -73,7 +76,8 @@ class ThrowIntoBox(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(self._low.astype(np.float32), high.astype(np.float32))
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (12,), np.float32)
         self.simulator = Simulator(box.scene(self.cloth, friction=self.friction), **OPTIONS)
-        self._rollouts: dict[str, Any] = {}
+        self._rest = self.simulator.state
+        self._throws: dict[str, Throws] = {}
         self.shift, self.turn, self.place = np.zeros(2), 0.0, np.array(box.PLACE)
         self._pushed = -1
         """Steps done with forces; -1: there was no reset yet."""
@@ -190,17 +194,16 @@ class ThrowIntoBox(gymnasium.Env):
         """
         if self._pushed < 0:
             raise InputError("there is no episode: call reset() first")
-        from ..torch import Rollout
+        from .gradient import Throws
 
-        if touches not in self._rollouts:
+        if touches not in self._throws:
             scene = box.scene(self.cloth, touches=touches, friction=self.friction)
-            self._rollouts[touches] = Rollout(scene, PART, **OPTIONS)
-        return returned(self._rollouts[touches], actions, self._start(), self.place)
+            self._throws[touches] = Throws(scene, **OPTIONS)
+        return self._throws[touches].returned(actions, self._start(), self.place)
 
-    def _start(self) -> Any:
+    def _start(self) -> State:
         """Makes the state that the episode starts from."""
-        position = box.pose(self.cloth, self.shift, self.turn)
-        return type(self.simulator.state)(**{**vars(self.simulator.stepper.frames.rest()), "position": position})
+        return dataclasses.replace(self._rest, position=box.pose(self.cloth, self.shift, self.turn))
 
     def _frames(self, name: str) -> np.ndarray:
         """Joins the frames since the reset [frames, nodes, width]."""
@@ -211,36 +214,3 @@ class ThrowIntoBox(gymnasium.Env):
         state, done = self.simulator.state, max(self._pushed, 0) / box.PUSHED
         seen = np.concatenate([state.position.ravel(), state.velocity.ravel(), self.place, [done]])
         return np.clip(seen, self._low, self._high).astype(np.float32)
-
-
-OPTIONS: dict[str, Any] = {"step": box.STEP, "integrator": box.INTEGRATOR}
-"""Of the simulator and of rollouts."""
-
-
-def returned(rollout: Any, actions: Any, start: Any, place: np.ndarray) -> torch.Tensor:
-    """Computes the return of a throw, a tensor that knows its gradient.
-
-    Args:
-        rollout: of ``PART`` steps of a ``box.scene``.
-        actions: a tensor [box.PUSHED, 12].
-        start: the state that it starts from.
-        place: of the box, x and y [m].
-    """
-    import torch
-
-    actions = torch.as_tensor(actions)
-    if tuple(actions.shape) != (box.PUSHED, 12) or not bool(torch.isfinite(actions).all()):
-        raise InputError(f"actions has shape {tuple(actions.shape)}, must be ({box.PUSHED}, 12), and finite")
-    forces = box.FORCE * actions.to(rollout.dtype).clamp(-1.0, 1.0).reshape(box.PUSHED, 4, 3)
-    inputs = {"forces": forces}
-    if "obstacle_position" in rollout.inputs:
-        inputs["obstacle_position"] = torch.as_tensor(box.obstacle_position(place)[: len(rollout.scene.obstacles)])
-    state, paths = start, []
-    for done in range(0, box.STEPS, PART):
-        frames = rollout(state=state, steps_done=done, **inputs)
-        paths.append(frames.position.mean(dim=1)[1 if paths else 0 :])
-        state = frames.last
-        if bool((paths[-1][:, 2] < box.ARRIVES).any()):
-            break
-    miss = box.arrival(torch.cat(paths))[:2] - torch.as_tensor(place)
-    return -miss.norm() / (0.5 * box.INNER)
