@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tqdm
 from common import add_slowdown, file_ending, make_folders, write_all
 from matplotlib.figure import Figure
@@ -35,7 +34,7 @@ from warp_yarn.io.usd import ENDINGS
 POLICIES = {"forces": throws.Forces, "network": throws.Network}
 SHOWN = (0, 30, 60, 90, 120, box.STEPS)
 """Frames in the picture."""
-VIEW = (-0.35, -1.0, 0.55)
+VIEW = (-0.3, -1.0, 1.2)
 """To the camera: along the throw, from above."""
 
 
@@ -139,7 +138,10 @@ def write(
 def moments(trajectory: wy.Trajectory) -> wy.Trajectory:
     """One frame that has a cloth for each moment of the throw."""
     cloths = [trajectory.cloth.replace(pose=trajectory.position[frame]) for frame in SHOWN]
-    return wy.Simulator(trajectory.scene.replace(cloth=cloths, forces=None), step=trajectory.step).run(0)
+    table, floor, *walls = trajectory.scene.obstacles
+    # planes are drawn beneath the first cloth alone
+    slab = wy.Box(center=(30e-3, 0, box.BOTTOM - 1e-3), half_extents=(80e-3, 40e-3, 1e-3), friction=floor.friction)
+    return wy.Simulator(wy.Scene(cloths, obstacles=[table, slab, *walls]), step=trajectory.step).run(0)
 
 
 def plot(path: Path, found: Sequence[throws.Epoch]) -> None:
