@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import into_box
 import numpy as np
 import torch
 import tqdm
@@ -238,8 +239,6 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         SimulationError, KeyboardInterrupt: what ended the search, after the best throw before was written.
     """
     if "--box" in (sys.argv[1:] if arguments is None else arguments):
-        import into_box
-
         return into_box.main(arguments)
     options = parser().parse_args(arguments)
     options.plot = options.plot or options.output.with_suffix(".png")

@@ -44,7 +44,7 @@ TERMS_BY_NAME = {f"{W}.description.scene"}
 
 ONLY = {
     "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "parts", "rollout", "run")}
-    | {f"{W}.calibration.problem", f"{W}.envs.gradient", f"{W}.envs.throw"},
+    | {f"{W}.calibration.problem", f"{W}.envs.gradient", f"{W}.envs.throw", f"{W}.envs.throws"},
     "gymnasium": {f"{W}.envs", f"{W}.envs.throw"},
     "stable_baselines3": set(),
     "pxr": {f"{W}.io.usd"},
