@@ -59,7 +59,7 @@ class ThrowIntoBox(gymnasium.Env):
         friction: μ of table, floor and walls, at least 0.
 
     Attributes:
-        trajectory: the frames since the reset, with the box where it is, to be drawn by ``wy.write_usd`` and others.
+        trajectory: the frames since the reset, with their scene, to be drawn by ``wy.write_usd`` and others.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  as Gymnasium declares it
@@ -81,6 +81,7 @@ class ThrowIntoBox(gymnasium.Env):
         self.shift, self.turn, self.place = np.zeros(2), 0.0, np.array(box.PLACE)
         self._pushed = -1
         """Steps done with forces; -1: there was no reset yet."""
+        self._forces = np.zeros((box.PUSHED, 4, 3))
         self._parts: list[Trajectory] = []
 
     def reset(
@@ -109,7 +110,7 @@ class ThrowIntoBox(gymnasium.Env):
         self.simulator.reset()
         self.simulator.place_obstacles(box.obstacle_position(self.place))
         self.simulator.state = self._start()
-        self._pushed, self._parts = 0, []
+        self._pushed, self._parts, self._forces = 0, [], np.zeros((box.PUSHED, 4, 3))
         return self._observed(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -121,10 +122,12 @@ class ThrowIntoBox(gymnasium.Env):
         """
         if not 0 <= self._pushed < box.PUSHED:
             raise gymnasium.error.ResetNeeded("the episode is over, or did not begin: call reset() first")
-        forces = box.FORCE * np.clip(finite_array("action", action, (12,)), -1.0, 1.0)
-        path = np.zeros((box.PUSHED + 1, 4, 3))
-        path[self._pushed] = forces.reshape(4, 3)
-        self.simulator.arrays["applied_force_path"].assign(path.reshape(-1, 3))
+        share = np.clip(finite_array("action", action, (12,)), -1.0, 1.0)
+        self._forces[self._pushed] = box.FORCE * share.reshape(4, 3)
+        # its last row is what stays after the pushes
+        self.simulator.arrays["applied_force_path"].assign(
+            np.pad(self._forces, ((0, 1), (0, 0), (0, 0))).reshape(-1, 3)
+        )
         self._pushed += 1
         info: dict[str, Any] = {}
         terminated = truncated = False
@@ -163,10 +166,11 @@ class ThrowIntoBox(gymnasium.Env):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The frames since the reset."""
+        """The frames since the reset, with the scene that makes them."""
         if self._pushed < 0:
             raise InputError("there are no frames: call reset() first")
-        scene = box.scene(self.cloth.replace(pose=self._start().position), place=self.place, friction=self.friction)
+        cloth = self.cloth.replace(pose=self._start().position)
+        scene = box.scene(cloth, self._forces, place=self.place, friction=self.friction)
         names = ("position", "euler", "velocity", "euler_velocity", "anchor")
         if not self._parts:
             values = {name: getattr(self.simulator.state, name)[None] for name in names}
