@@ -73,12 +73,12 @@ def test_gradient_descent_as_published_makes_a_step_for_each_parameter(published
 
 
 def test_the_published_faults_put_the_goal_out_of_reach():
-    """One frame of force instead of six and an upright start: the strongest force stays 48 mm and more away."""
+    """One frame of force instead of six and an upright start: the strongest force stays 51 mm and more away."""
     faulty = control.Published(pushed=1, pose="upright", steps=94)
     reaches = [faulty.reach(same(y, z)) for y, z in itertools.product((0.0, control.STRONGEST), repeat=2)]
     np.testing.assert_allclose(1e3 * reaches[-1], (0.0, 18.7, -24.9), atol=0.05)
     # an impulse moves the centre in proportion, so that nothing between is nearer than the nearest corner's reach
-    assert min(float((reach - faulty.goal).norm()) for reach in reaches) > 48e-3
+    assert min(float((reach - faulty.goal).norm()) for reach in reaches) > 51e-3
 
 
 def test_the_published_network_learns(published):
@@ -141,7 +141,7 @@ def test_forces_are_bounded_and_repeat(kind, flight):
     torch.testing.assert_close(other(flight.start, 0), kind(3)(flight.start, 0), rtol=0.0, atol=0.0)
     assert not torch.equal(other(flight.start, 0), kind(4)(flight.start, 0))
     # upward on the whole, where learning begins
-    assert float(other(flight.start, 0)[:, 2].mean()) > 0.2 * box.FORCE
+    assert float(other(flight.start, 0).detach()[:, 2].mean()) > 0.2 * box.FORCE
 
 
 @pytest.mark.parametrize(("kind", "seed", "epochs"), [(throws.Forces, 4, 8), (throws.Network, 0, 6)])
@@ -193,6 +193,7 @@ def test_a_throw_that_fails_is_taken_back():
         (lambda: throws.Throw(at=5), "at = 5"),
         (lambda: throws.Throw(touches="walls"), "touches = 'walls'"),
         (lambda: throws.Throw(friction=-1.0), "friction = -1"),
+        (lambda: throws.Throw(step=5e-4), "step = 0.0005"),
         (lambda: next(throws.learn(None, throws.Forces(0), 0)), "epochs = 0"),
         (lambda: next(throws.learn(None, throws.Forces(0), 1, rate=0.0)), "rate = 0"),
         (lambda: next(throws.learn(None, throws.Forces(0), 1, bound=0.0)), "bound = 0"),

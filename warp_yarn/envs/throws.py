@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ..description.scene import Scene
-from ..errors import GradientError, SimulationError, integer, real
+from ..errors import GradientError, InputError, SimulationError, integer, real
 from ..gradients.rollout import Frames, Rollout
 from ..simulation.simulator import Simulator
 from ..simulation.state import State, Trajectory
@@ -43,8 +43,11 @@ class Throw:
             anything but air decides.
         touches: "nothing", "table" or "all" (``box.TOUCHES``): what the cloth touches while it learns.
         friction: μ of it, while it learns.
-        step: h [s]; ``at`` counts in ``box.STEP`` whatever it is.
-        options: of the Rollout, such as ``integrator``.
+        place: the box's middle, in x and y [m].
+        options: of the Rollout, but its step.
+
+    Raises:
+        InputError: ``at`` before forces have ended, or as of ``box.scene`` and a Rollout.
 
     Attributes:
         start: the state in which the cloth lies on the table.
@@ -56,13 +59,13 @@ class Throw:
         at: int | None = None,
         touches: str = "nothing",
         friction: float = box.FRICTION,
-        shift: Any = (0.0, 0.0),
-        turn: float = 0.0,
         place: Any = box.PLACE,
         **options: Any,
     ):
+        if "step" in options:
+            raise InputError(f"step = {options['step']!r} is no option of a Throw: forces act for {box.PUSHED} ms")
         self.at, self.place = at, place
-        self.cloth = box.cloth(shift, turn)
+        self.cloth = box.cloth()
         scene = box.scene(self.cloth, np.zeros((1, 4, 3)), place=place, friction=friction, touches=touches)
         options = {"step": box.STEP, "integrator": box.INTEGRATOR, **options}
         rest = integer("at", FLIGHT if at is None else at, least=box.PUSHED + 1) - box.PUSHED
