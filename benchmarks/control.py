@@ -398,7 +398,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("what", choices=("published", "box", "variants"))
     parser.add_argument("--seeds", type=int, default=5, help="(%(default)s)")
     parser.add_argument("--epochs", type=int, default=EPOCHS, help="of each method that has gradients (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=800, help="of each that has none (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=512, help="of each that has none (%(default)s)")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="of box (all)")
     parser.add_argument("--output", type=Path, help="CSV file (benchmarks/results/control_WHAT.csv)")
     parser.add_argument("--plot", type=Path, default=PICTURES / "control.png", help="of box (docs/control.png)")

@@ -187,7 +187,7 @@ def learn(
     bound: float = BOUND,
     judged: Callable[[np.ndarray, Any], tuple[float, bool]] | None = None,
 ) -> Iterator[Epoch]:
-    """Improves a policy by Adam, and judges the throw of each epoch in the true scene.
+    """Learns a policy by Adam, and judges the throw of each epoch in the true scene.
 
     Args:
         throw: what is learned from.
