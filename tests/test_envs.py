@@ -1,6 +1,7 @@
 """The task of the box, as a Gymnasium environment, and the gradient of its return."""
 
 import copy
+import hashlib
 import resource
 import subprocess
 import sys
@@ -181,32 +182,32 @@ def test_gymnasium_makes_several_side_by_side(mode):
 
 
 def random_rollout(env, steps, seed):
-    """Actions at random, and resets too, before episodes are over; gives all that it was told, and its first seed."""
-    rng, told, over = np.random.default_rng(seed), [], True
+    """Actions at random, and resets too, before episodes are over; a digest of all that it was told."""
+    rng, told, over = np.random.default_rng(seed), hashlib.sha256(), True
     env.reset(seed=seed)
     for _ in range(steps):
         if over or rng.random() < 0.1:
-            told.append(env.reset()[0])
+            told.update(env.reset()[0].tobytes())
         seen, reward, terminated, truncated, info = env.step(rng.uniform(-1.2, 1.2, 12).astype(np.float32))
-        told.append(np.append(seen, [reward, terminated, truncated, info.get("is_success", 0)]).astype(np.float64))
+        assert np.isfinite(seen).all() and np.isfinite(reward)
+        told.update(seen.tobytes())
+        told.update(repr((reward, terminated, truncated, info)).encode())
         over = terminated or truncated
-    return np.concatenate(told)
+    return told.hexdigest()
 
 
 @pytest.mark.parametrize("steps", [60, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_a_random_rollout_repeats_and_leaks_nothing(env, steps):
-    """Bit for bit, in another environment and in one that has done other things. The process may grow by what the
-    allocator does not give back, and not by what an episode takes, 0.1 MB, times episodes."""
+    """Bit for bit, in another environment and in one that has done other things. What the process may grow by is what
+    the allocator does not give back: far less than 1 kB for each of some 2400 episodes, whose frames take 0.3 MB."""
     other = ThrowIntoBox()
-    expected = random_rollout(env, 60, seed=7)
-    assert np.isfinite(expected).all()
+    short = random_rollout(other, 60, seed=7)
+    assert random_rollout(env, 60, seed=8) != short
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    again = random_rollout(other, steps, seed=7)
+    expected = random_rollout(other, steps, seed=7)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    assert np.array_equal(again[: len(expected)], expected)
-    assert np.array_equal(random_rollout(env, 60, seed=7), expected)
-    assert not np.array_equal(random_rollout(env, 60, seed=8)[: 6 * NODES], expected[: 6 * NODES])
-    assert grown < 20_000
+    assert random_rollout(env, steps, seed=7) == expected
+    assert grown < 2_000
 
 
 def test_starts_and_boxes_are_at_random_within_what_is_said(env):
