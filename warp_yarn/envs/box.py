@@ -137,13 +137,13 @@ def target(place: Any = PLACE) -> np.ndarray:
 
 
 def inside(position: np.ndarray, place: Any = PLACE) -> np.ndarray:
-    """Tells of frames whether every node is between the walls and below their top, [..., nodes, 3] to [...]."""
+    """Tells in which frames every node is between the walls and below their top, [..., nodes, 3] to [...]."""
     off = np.abs(position[..., :2] - np.asarray(place)).max(axis=-1) < 0.5 * INNER
     return (off & (position[..., 2] < BOTTOM + WALL)).all(axis=-1)
 
 
 def at_rest(velocity: np.ndarray) -> np.ndarray:
-    """Tells of frames whether every node is slower than ``REST_SPEED``, [..., nodes, 3] to [...]."""
+    """Tells in which frames every node is slower than ``REST_SPEED``, [..., nodes, 3] to [...]."""
     return (np.linalg.norm(velocity, axis=-1) < REST_SPEED).all(axis=-1)
 
 

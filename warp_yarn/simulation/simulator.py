@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from ..description.obstacles import unit_quaternion
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..device.model import Model
-from ..errors import InputError, choice, finite_array, integer
+from ..errors import choice, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
@@ -22,7 +21,7 @@ from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
 from .diagnosis import Failure
 from .frames import Frames
-from .inspection import Inspection
+from .placing import Placing
 from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
@@ -43,7 +42,7 @@ def _of_stepper(name: str) -> Any:
     )
 
 
-class Simulator(Inspection):
+class Simulator(Placing):
     """Simulates a scene.
 
     Threads may share one, and simulators may run in several threads: each call is as if it were alone. After an
@@ -173,44 +172,6 @@ class Simulator(Inspection):
     @alone
     def steps_done(self, steps: int) -> None:
         self.stepper.count_from(integer("steps_done", steps, least=0, most=LARGEST))
-
-    @alone
-    def place_obstacles(self, position: Any, rotation: Any = None) -> None:
-        """Places obstacles that stand still elsewhere, which needs no other simulator; the state stays as it is.
-
-        Frames still name the scene, with obstacles where that has them.
-
-        Args:
-            position: p of every obstacle, in the scene's order [obstacles, 3] (m).
-            rotation: quaternions (x, y, z, w) [obstacles, 4]; None: they are not turned.
-
-        Raises:
-            InputError: a scene without obstacles, or with one that has a path; or a place nearer to the present state
-                than cloth may come: obstacles then stay where they were.
-        """
-        contact, a = self.model.contact, self.arrays
-        if not contact.obstacles or contact.obstacles_move:
-            raise InputError("place_obstacles: the scene must have obstacles, and none of them a path")
-        count = len(self.scene.obstacles)
-        places = {"obstacle_position": finite_array("position", position, (count, 3)) - a.origin}
-        if rotation is not None:
-            turned = finite_array("rotation", rotation, (count, 4))
-            places["obstacle_rotation"] = np.array([unit_quaternion(f"rotation[{k}]", q) for k, q in enumerate(turned)])
-        before = {name: a[name].numpy().copy() for name in places}
-
-        def put(values: dict[str, np.ndarray]) -> None:
-            for name, value in values.items():
-                a[name].assign(value)
-            contact.stand_still()
-            # what lies on an obstacle goes on elsewhere, which is no gain of energy
-            self.model.energy.forget()
-
-        try:
-            put(places)
-            self.check_clear()
-        except BaseException:
-            put(before)
-            raise
 
     split_steps = _of_stepper("split_steps")
     damped_steps = _of_stepper("damped_steps")
