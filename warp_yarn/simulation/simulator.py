@@ -29,7 +29,7 @@ from .substepping import Substepping
 
 BESIDE_TERMS = (
     *("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path"),
-    *("obstacle_position", "obstacle_rotation", "obstacle_position_before", "obstacle_rotation_before"),
+    *("obstacle_position", "obstacle_rotation"),
 )
 """Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
 
@@ -201,7 +201,6 @@ class Simulator(Inspection):
         def put(values: dict[str, np.ndarray]) -> None:
             for name, value in values.items():
                 a[name].assign(value)
-            contact.stand_still()
             # what lies on an obstacle goes on elsewhere, which is no gain of energy
             self.model.energy.forget()
 
