@@ -245,19 +245,11 @@ class Contact:
         """Put obstacles where they are at the time of a stage, and note where they were at that of the state before."""
         if self.obstacles_move:
             self._place(stage - 1 if stage == 1 else AT_START)
-            self._note_places()
+            for part, kernel in (("position", "copy_vectors"), ("rotation", "copy_rotations")):
+                a = self.model.arrays
+                arrays = {"source": a[f"obstacle_{part}"], "target": a[f"obstacle_{part}_before"]}
+                self.model.launch(kernel, "obstacles", **arrays)
             self._place(stage)
-
-    def stand_still(self) -> None:
-        """Note that obstacles without a path were always where they are, after they were put there."""
-        if self.obstacles and not self.obstacles_move:
-            self._note_places()
-
-    def _note_places(self) -> None:
-        a = self.model.arrays
-        for part, kernel in (("position", "copy_vectors"), ("rotation", "copy_rotations")):
-            arrays = {"source": a[f"obstacle_{part}"], "target": a[f"obstacle_{part}_before"]}
-            self.model.launch(kernel, "obstacles", **arrays)
 
     def _place(self, stage: int) -> None:
         self.model.launch("place_obstacles", "obstacles", stage=stage, step_duration=self.model.step_size)

@@ -143,7 +143,6 @@ class DeviceRun:
         for name, value in given.items():
             if name not in FIELDS:
                 flat(arrays[array_of(name, value)])[: value.numel()].copy_(value.reshape(-1))
-        simulator.model.contact.stand_still()
         simulator.state = State(*(given[name].cpu().numpy() for name in FIELDS))
         simulator.steps_done = steps_done
         simulator.split_steps, simulator.damped_steps = {}, set()

@@ -40,7 +40,6 @@ class Placing(Inspection):
         def put(values: dict[str, np.ndarray]) -> None:
             for name, value in values.items():
                 a[name].assign(value)
-            contact.stand_still()
             # what lies on an obstacle goes on elsewhere, which is no gain of energy
             self.model.energy.forget()
 

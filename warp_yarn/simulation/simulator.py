@@ -28,7 +28,7 @@ from .substepping import Substepping
 
 BESIDE_TERMS = (
     *("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path"),
-    *("obstacle_position", "obstacle_rotation", "obstacle_position_before", "obstacle_rotation_before"),
+    *("obstacle_position", "obstacle_rotation"),
 )
 """Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
 
