@@ -46,6 +46,7 @@ ONLY = {
     | {f"{W}.calibration.problem"},
     "pxr": {f"{W}.io.usd"},
     "h5py": {f"{W}.io.published"},
+    "dtx_to_wif": {f"{W}.io.draft"},
     "pyvista": set(),
     "scenes": set(),
     "benchmarks": set(),
@@ -148,7 +149,19 @@ def test_importing_the_package_loads_no_extra():
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert {"warp", "warp_yarn", "numpy"} <= loaded
-    extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
+    extras = {
+        "pxr",
+        "torch",
+        "pyvista",
+        "vtk",
+        "vtkmodules",
+        "imageio",
+        "h5py",
+        "dtx_to_wif",
+        "scipy",
+        "matplotlib",
+        "newton",
+    }
     assert not loaded & extras
 
 
