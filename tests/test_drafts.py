@@ -289,15 +289,21 @@ def test_paths_and_options_that_cannot_be(tmp_path):
 
 def measured(path: Path) -> tuple[wy.Draft | wy.InputError, float, int]:
     """What reading and drawing down a file gives, in s of this process's time, and in bytes at most at once."""
-    tracemalloc.start()
-    try:
-        begin = time.process_time()
+
+    def draw() -> wy.Draft | wy.InputError:
         try:
             found = quiet(path)
             assert found.warp_on_top.shape == (found.picks, found.ends)
         except wy.InputError as error:
-            found = error
-        return found, time.process_time() - begin, tracemalloc.get_traced_memory()[1]
+            return error
+        return found
+
+    begin = time.process_time()
+    draw()
+    seconds = time.process_time() - begin
+    tracemalloc.start()  # which makes it several times slower
+    try:
+        return draw(), seconds, tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
 
@@ -325,22 +331,35 @@ def as_large_as_may_be() -> dict[str, str]:
     }
 
 
-@pytest.mark.parametrize("kind", as_large_as_may_be())
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind != "again")) for kind in as_large_as_may_be()]
+)
 def test_no_file_takes_long_nor_much(written, kind):
-    """One second and 100 MB; tracing memory makes it some three times slower, and is left in."""
     text = as_large_as_may_be()[kind]
     assert len(text) < reader.MOST_BYTES
     found, seconds, size = measured(written(text))
     assert isinstance(found, wy.Draft) == (kind not in ("lines", "sections", "too many"))
-    assert seconds < 1.0 * 3.0 and size < 100e6
+    assert seconds < 1.0 and size < 100e6
 
 
-def test_whatever_is_broken_is_a_draft_or_an_input_error(written):
-    """Files of ours with pieces cut out, doubled, exchanged and overwritten."""
+def installed(*endings: str) -> list[Path]:
+    """Those that dtx-to-wif brings along for its own tests."""
+    found = importlib.util.find_spec("dtx_to_wif")
+    folder = Path(found.origin).parents[1] / "test_data" if found and found.origin else OWN / "none"
+    return sorted(path for path in folder.rglob("*") if path.suffix in endings)
+
+
+@pytest.mark.parametrize("ending", reader.ENDINGS)
+def test_whatever_is_broken_is_a_draft_or_an_input_error(written, ending):
+    """Small files with pieces cut out, doubled, exchanged and overwritten."""
     chance = random.Random(1)
-    originals = [path.read_bytes() for path in sorted(OWN.glob("*.wif"))]
+    files = sorted(OWN.glob("*.wif")) if ending == ".wif" else installed(ending)
+    if not files:
+        pytest.skip("dtx-to-wif is not installed")
+    originals = [path.read_bytes() for path in files]
+    originals = [data for data in originals if len(data) < 5000]
     drafts = 0
-    for _ in range(200):
+    for _ in range(150 if ending == ".wif" else 40):
         data = bytearray(chance.choice(originals))
         for _ in range(chance.randint(1, 4)):
             a, b = sorted(chance.randrange(len(data) + 1) for _ in range(2))
@@ -354,27 +373,22 @@ def test_whatever_is_broken_is_a_draft_or_an_input_error(written):
                 data[a:b] = chance.choice(originals)[a:b]
             else:
                 data[a:b] = bytes(chance.choice(b"0123456789=,;[]-.\n\r\t eE%\xff") for _ in range(b - a))
-        found, seconds, size = measured(written(bytes(data)))
+        found, seconds, size = measured(written(bytes(data), f"draft{ending}"))
         drafts += isinstance(found, wy.Draft)
         assert seconds < 1.0 and size < 100e6
-    assert 20 < drafts < 180  # both are tried
+    assert drafts  # of some the meaning is still there  # both are tried
 
 
 # -- files of others ---------------------------------------------------------------------------------------------------
-
-
-def installed() -> list[Path]:
-    """Those that dtx-to-wif brings along for its own tests."""
-    found = importlib.util.find_spec("dtx_to_wif")
-    folder = Path(found.origin).parents[1] / "test_data" if found and found.origin else Path()
-    return sorted(path for path in folder.rglob("*") if path.suffix in reader.ENDINGS) if found else []
 
 
 def elsewhere() -> list[Path]:
     return sorted(path for path in Path(ELSEWHERE).rglob("*") if path.suffix in reader.ENDINGS) if ELSEWHERE else []
 
 
-@pytest.mark.parametrize("path", [*installed(), *elsewhere()], ids=lambda path: f"{path.parent.name}/{path.name}")
+@pytest.mark.parametrize(
+    "path", [*installed(*reader.ENDINGS), *elsewhere()], ids=lambda path: f"{path.parent.name}/{path.name}"
+)
 def test_files_of_others(path, tmp_path):
     """Those that dtx-to-wif reads have its drawdown, of its own tables, and are written and read the same."""
     dtx_to_wif = pytest.importorskip("dtx_to_wif")
@@ -396,21 +410,21 @@ def test_files_of_others(path, tmp_path):
             pattern = dtx_to_wif.read_pattern_file(path)
     except Exception:
         return  # what it cannot read
+    threading = [frozenset(pattern.threading.get(end, set())) for end in range(1, found.ends + 1)]
     for pick in range(1, found.picks + 1):
         if pattern.tieup and pattern.treadling:
             up = set().union(*(pattern.tieup.get(treadle, set()) for treadle in pattern.treadling.get(pick, set())))
         else:
             up = pattern.liftplan.get(pick, set())
-        expected = [bool(pattern.threading.get(end, set()) & (up - {0})) for end in range(1, found.ends + 1)]
-        np.testing.assert_array_equal(found.warp_on_top[pick - 1], np.equal(expected, pattern.is_rising_shed))
+        over = {shafts: bool(shafts & (up - {0})) == pattern.is_rising_shed for shafts in set(threading)}
+        assert found.warp_on_top[pick - 1].tolist() == [over[shafts] for shafts in threading]
     assert not {end for end, shafts in pattern.threading.items() if shafts - {0} and end > found.ends}
 
 
-def test_there_are_thirty_files(request):
-    if not installed():
+def test_there_are_thirty_files():
+    if not installed(".wif"):
         pytest.skip("dtx-to-wif is not installed")
-    wif = [path for path in [*installed(), *OWN.iterdir()] if path.suffix == ".wif"]
-    assert len(wif) > 30
+    assert len(installed(".wif")) + len(list(OWN.glob("*.wif"))) > 30
 
 
 DTX = """@@StartDTX
