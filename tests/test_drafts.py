@@ -57,7 +57,7 @@ def test_the_drawdown_of_every_program(path):
 
 NAMES = {
     "fiberworks": "zigzag.dtx; 100 % wool",
-    "tempoweave": "",
+    "tempoweave": "tempoweave",
     "dbweave": r"C:\drafts\zigzag.dbw",
     "weavepoint": "zigzag.wpo",
     "weaveit": "weaveit",
@@ -193,6 +193,8 @@ MALFORMED = {
     "bracket": ("[TIEUP]", "[TIEUP", r"line \d+: '\[TIEUP' has no \]"),
     "no =": ("Shafts=4", "Shafts 4", r"\[WEAVING\] 'Shafts 4' has no ="),
     "twice": ("3=3\r\n4=4\r\n5=1", "3=3\r\n3=4\r\n5=1", r"\[THREADING\] 3 is there twice, as '3' and as '4'"),
+    "twice, 0": ("3=3\r\n4=4\r\n5=1", "3=3\r\n03=4\r\n5=1", r"\[THREADING\] 3 is there twice, as '3' and as '4'"),
+    "thread 0": ("[WARP SPACING]", "[WARP SPACING]\r\n0=1", r"\[WARP SPACING\] key = '0', must be .* from 1"),
     "no threading": ("[THREADING]", "[PRIVATE]", r"\[THREADING\] is missing or empty"),
     "no tie-up": ("[TIEUP]", "[PRIVATE]", r"\[TIEUP\] is missing or empty, which \[TREADLING\] needs"),
     "no treadling": ("[TREADLING]", "[PRIVATE]", r"\[TREADLING\] is missing or empty, which \[TIEUP\] needs"),

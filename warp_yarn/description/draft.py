@@ -72,7 +72,7 @@ class Draft:
             for kind in OF_THREADS:
                 keep(f"{thread}_{kind}", _of_threads(f"{thread}_{kind}", getattr(self, f"{thread}_{kind}"), count))
         readable = "".join(character if character.isprintable() else " " for character in str(self.name))
-        keep("name", " ".join(readable.split()))
+        keep("name", " ".join(readable.split()) or "draft")
 
     @classmethod
     def from_weave(cls, weave: Weave) -> Draft:

@@ -54,9 +54,13 @@ def read_draft(path: str | os.PathLike, *, rising: bool | None = None) -> Draft:
         raise InputError(f"{path}: is larger than {MOST_BYTES} bytes, must be at most as large")
     try:
         sections = sections_of(_decoded(data)) if ending == ".wif" else _foreign(data, ending, path.name)
-        return Reading(sections, str(path), rising).draft(path.stem)
+        reading = Reading(sections, rising)
+        draft = reading.draft(path.stem)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    for message in reading.told:
+        warnings.warn(f"{path}: {message}", stacklevel=2)
+    return draft
 
 
 def write_draft(path: str | os.PathLike, draft: Draft | Weave) -> None:

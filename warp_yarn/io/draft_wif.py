@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import re
-import warnings
 from collections.abc import Sequence
 from decimal import Decimal
 from fractions import Fraction
@@ -76,6 +75,8 @@ def _add(section: dict[str, str], name: str, line: str) -> None:
         if not equals and name not in NUMBERED:
             raise InputError(f"[{name}] {line[:40]!r} has no =")
     key, value = " ".join(key.split()).upper(), value.strip()
+    if name in NUMBERED and re.fullmatch(r"\+?[0-9]{1,9}", key):
+        key = str(int(key))  # 01 is 1
     if section.get(key, value) != value and name != "TEXT":
         raise InputError(f"[{name}] {key} is there twice, as {section[key][:40]!r} and as {value[:40]!r}")
     section[key] = value
@@ -87,13 +88,13 @@ class Reading:
 
     Args:
         sections: what it says.
-        path: what warnings call it.
         rising: whether shafts rise, instead of what it says; None: as it says.
     """
 
     sections: Sections
-    path: str
     rising: bool | None
+    told: list[str] = dataclasses.field(default_factory=list)
+    """What was left out, or taken for granted."""
 
     def draft(self, name: str) -> Draft:
         """Makes its draft. ``name``: where it has no title.
@@ -112,18 +113,19 @@ class Reading:
             known[f"{thread}_colors"] = self._colors(thread.upper(), count)
             for kind in OF_THREADS[1:]:
                 known[f"{thread}_{kind}"] = self._lengths(thread.upper(), kind.upper(), count)
-        title = self._value("TEXT", "TITLE")
         result = Draft(
             threading=threading,
             treadling=treadling,
             tieup=tieup,
             rising=self._rising(),
-            name=name if title is None else title,
+            name=self._value("TEXT", "TITLE") or name,
             **known,
         )
         shafts = self._count("WEAVING", "SHAFTS") or result.shafts
         if shafts < result.shafts:
-            self._warn(f"[WEAVING] Shafts = {shafts}, but shaft {result.shafts} is used: taken as {result.shafts}")
+            self.told.append(
+                f"[WEAVING] Shafts = {shafts}, but shaft {result.shafts} is used: taken as {result.shafts}"
+            )
         return result
 
     # -- what moves ----------------------------------------------------------------------------------------------------
@@ -159,7 +161,7 @@ class Reading:
             return value.upper() in YES
         if value:
             raise InputError(f"[WEAVING] Rising Shed = {value[:40]!r}, must be true or false")
-        self._warn("[WEAVING] Rising Shed is missing: taken as true. rising=False says that shafts sink")
+        self.told.append("[WEAVING] Rising Shed is missing: taken as true. rising=False says that shafts sink")
         return True
 
     def _tell_unused(self, counts: dict[str, int], moving: str) -> None:
@@ -167,7 +169,7 @@ class Reading:
         for (thread, count), section in zip(counts.items(), ("THREADING", moving), strict=True):
             threads = self._count(thread.upper(), "THREADS")
             if threads is not None and threads > count:
-                self._warn(
+                self.told.append(
                     f"[{thread.upper()}] Threads = {threads}, of which [{section}] uses {count}: the rest is left out"
                 )
 
@@ -191,7 +193,7 @@ class Reading:
         """Reads red, green and blue of every thread [count, 3] from 0 to 1."""
         default = self._value(thread, "COLOR") or ""
         single = {k: v for k, v in self._numbered(f"{thread} COLORS", count).items() if v}
-        table = {k: v for k, v in self._numbered("COLOR TABLE", MOST_THREADS).items() if v}
+        table = {k: v for k, v in self._numbered("COLOR TABLE", MOST_THREADS, least=0).items() if v}
         if not single and not (default and table):
             return None
         rgb: dict[int, list[float]] = {}
@@ -241,7 +243,7 @@ class Reading:
             return None
         units = self._value(thread, "UNITS") or ""
         if not units:
-            self._warn(f"[{thread}] Units is missing: {key} is left out")
+            self.told.append(f"[{thread}] Units is missing: {key} is left out")
             return None
         if units.upper() not in UNITS:
             raise InputError(f"[{thread}] Units = {units[:40]!r}, must be Centimeters, Inches or Decipoints")
@@ -251,7 +253,9 @@ class Reading:
             result[number - 1] = _length(f"[{section}] {number}", value, unit)
         if np.isnan(result).any():
             number = int(np.isnan(result).argmax()) + 1
-            self._warn(f"[{thread}] {key} is missing, and [{section}] has none for thread {number}: it is left out")
+            self.told.append(
+                f"[{thread}] {key} is missing, and [{section}] has none for thread {number}: it is left out"
+            )
             return None
         return result
 
@@ -265,15 +269,12 @@ class Reading:
         value = self._value(section, key)
         return (_whole(f"[{section}] {key.capitalize()}", value, 0, MOST_THREADS) if value else 0) or None
 
-    def _numbered(self, section: str, count: int) -> dict[int, str]:
+    def _numbered(self, section: str, count: int, least: int = 1) -> dict[int, str]:
         """Gives the values of the threads that there are, by number."""
         values = {}
         for key, value in self.sections.get(section, {}).items():
-            values[_whole(f"[{section}] key", key, 0, MOST_THREADS)] = value
+            values[_whole(f"[{section}] key", key, least, MOST_THREADS)] = value
         return {k: value for k, value in values.items() if k <= count}
-
-    def _warn(self, message: str) -> None:
-        warnings.warn(f"{self.path}: {message}", stacklevel=2)
 
 
 def _whole(where: str, text: str, least: int, most: int, within: str = "") -> int:
