@@ -70,11 +70,13 @@ INCHES = {
     "pixeloom": ([0.05] * 6, [0.1] * 5),  # 36 and 72 of 720
 }
 WHITE, OCHRE, BLUE = (1.0, 1.0, 1.0), (1.0, 532 / 999, 0.0), (0.0, 0.0, 599 / 999)
+BLUEISH, PLUM = (35 / 200, 97 / 200, 158 / 200), (105 / 200, 40 / 200, 67 / 200)  # from 20 to 220
 COLORS = {
     "fiberworks": ([WHITE] + [OCHRE] * 5, [WHITE, BLUE, WHITE, BLUE, WHITE]),
     "tempoweave": ([(1.0, 1.0, 0.8)] * 6, [(85 / 255, 107 / 255, 47 / 255)] * 5),
     "dbweave": ([(5 / 255, 10 / 255, 243 / 255)] * 6, [(0.0, 0.0, 1.0)] * 5),
     "weavepoint": ([WHITE, (1.0, 0.0, 0.0)] + [WHITE] * 4, [(1.0, 0.0, 0.0)] * 5),
+    "weaveit": ([PLUM] * 6, [SKY, SKY, BLUEISH, PLUM, SKY]),
     "pixeloom": ([(1.0, 0.0, 0.0)] * 6, [(0.0, 1.0, 0.0)] * 5),
 }
 
@@ -574,23 +576,23 @@ def test_a_draft_is_repeated_and_cut_with_all_that_is_known_of_its_threads():
 
 
 def test_a_cloth_is_dyed_as_the_draft_says():
-    draft = quiet(OWN / "fiberworks.wif").tiled(rows=7, columns=6)
-    cloth = wy.fabrics.cotton(rows=7, columns=6, weave=draft.weave)
+    draft = quiet(OWN / "fiberworks.wif").tiled(rows=8, columns=6)
+    cloth = wy.fabrics.cotton(rows=8, columns=6, weave=draft.weave)
     dyed = draft.dyed(cloth)
     seen = [dyed.yarns[k].color for k in dyed.material]
     # the last end is the first row
-    assert seen[:7] == [tuple(color) for color in draft.warp_colors[::-1].tolist()]
-    assert seen[7:] == [tuple(color) for color in draft.weft_colors.tolist()]
+    assert seen[:8] == [tuple(color) for color in draft.warp_colors[::-1].tolist()]
+    assert seen[8:] == [tuple(color) for color in draft.weft_colors.tolist()]
     assert len(dyed.yarns) == 3
     np.testing.assert_array_equal(dyed.weave.flipped, draft.weave.flipped)
-    paper = wy.paper.cloth(rows=7, columns=6)
+    paper = wy.paper.cloth(rows=8, columns=6)
     two = draft.dyed(paper)
     assert [two.yarns[k].density for k in two.material] == [paper.yarns[k].density for k in paper.material]
     assert two.friction_damping == paper.friction_damping and two.spacing == paper.spacing
-    with pytest.raises(wy.InputError, match="has 7 warp and 6 weft yarns, must have 6 and 5"):
+    with pytest.raises(wy.InputError, match="has 8 warp and 6 weft yarns, must have 6 and 5"):
         quiet(OWN / "fiberworks.wif").dyed(cloth)
     with pytest.raises(wy.InputError, match="has no colors"):
-        quiet(OWN / "minimum.wif").tiled(rows=7, columns=6).dyed(cloth)
+        quiet(OWN / "minimum.wif").tiled(rows=8, columns=6).dyed(cloth)
     with pytest.raises(wy.InputError, match="must be a Cloth"):
         draft.dyed(draft)
 
