@@ -70,13 +70,13 @@ INCHES = {
     "pixeloom": ([0.05] * 6, [0.1] * 5),  # 36 and 72 of 720
 }
 WHITE, OCHRE, BLUE = (1.0, 1.0, 1.0), (1.0, 532 / 999, 0.0), (0.0, 0.0, 599 / 999)
-BLUEISH, PLUM = (35 / 200, 97 / 200, 158 / 200), (105 / 200, 40 / 200, 67 / 200)  # from 20 to 220
+STEEL, PLUM = (35 / 200, 97 / 200, 158 / 200), (105 / 200, 40 / 200, 67 / 200)  # from 20 to 220
 COLORS = {
     "fiberworks": ([WHITE] + [OCHRE] * 5, [WHITE, BLUE, WHITE, BLUE, WHITE]),
     "tempoweave": ([(1.0, 1.0, 0.8)] * 6, [(85 / 255, 107 / 255, 47 / 255)] * 5),
     "dbweave": ([(5 / 255, 10 / 255, 243 / 255)] * 6, [(0.0, 0.0, 1.0)] * 5),
     "weavepoint": ([WHITE, (1.0, 0.0, 0.0)] + [WHITE] * 4, [(1.0, 0.0, 0.0)] * 5),
-    "weaveit": ([PLUM] * 6, [SKY, SKY, BLUEISH, PLUM, SKY]),
+    "weaveit": ([STEEL] * 6, [PLUM, PLUM, STEEL, PLUM, PLUM]),
     "pixeloom": ([(1.0, 0.0, 0.0)] * 6, [(0.0, 1.0, 0.0)] * 5),
 }
 
