@@ -551,8 +551,19 @@ def test_a_weave_gets_the_loom_that_it_needs(tmp_path, words):
     assert draft.name == words == draft.weave.name
     distinct = len(np.unique(weave.flipped, axis=0)), len(np.unique(weave.flipped, axis=1).T)
     assert (draft.shafts, len(draft.tieup)) in ((distinct[0], distinct[1]), (distinct[0] - 1, distinct[1]))
-    one = wy.Draft.from_weave(wy.Weave(np.zeros((3, 4))))
-    assert not one.warp_on_top.any() and one.warp_on_top.shape == (4, 3)
+
+
+@pytest.mark.parametrize("tieup", [None, [[], []], [[1], [2]]])
+def test_a_loom_that_never_moves_is_written_and_read(tmp_path, tieup):
+    path = tmp_path / "draft.wif"
+    draft = wy.Draft(threading=[[1], [2], []], treadling=[[], [1] if tieup == [[], []] else []], tieup=tieup)
+    assert not draft.warp_on_top.any() and draft.warp_on_top.shape == (2, 3)
+    weave = wy.Weave(np.zeros((3, 4)))
+    for each in (draft, weave):
+        wy.write_draft(path, each)
+        with pytest.warns(UserWarning, match="no pick moves a shaft"):
+            again = wy.read_draft(path)
+        assert again == (draft if each is draft else wy.Draft.from_weave(weave))
 
 
 # -- drafts in Python --------------------------------------------------------------------------------------------------
@@ -604,6 +615,7 @@ def test_a_cloth_is_dyed_as_the_draft_says():
         ({"threading": [1, 2, 3]}, "must be a list of lists"),
         ({"threading": []}, "threading has 0 entries, must have 1 to 10000"),
         ({"threading": [[1]] * 10_001}, "threading has 10001 entries"),
+        ({"threading": [[], [0], []]}, "threading has no end on any shaft"),
         ({"threading": [[-1]]}, r"threading\[0\] = -1, must be a whole number, from 0 to 10000"),
         ({"threading": [[1.5]]}, r"threading\[0\] = 1\.5"),
         ({"treadling": [[1], [3]]}, r"treadling\[1\] = 3, must be a whole number, from 0 to 2"),

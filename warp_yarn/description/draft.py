@@ -31,7 +31,7 @@ class Draft:
     """What a loom weaves. Ends, picks, shafts and treadles count from 1 in what it is made of.
 
     Args:
-        threading: the shafts of each end, none to several.
+        threading: the shafts of each end, none to several, but not none of all.
         treadling: the treadles of each pick; without a tie-up, the shafts (a liftplan).
         tieup: the shafts of each treadle; None: there is a liftplan.
         rising: whether shafts rise that are trodden; else they sink, and the rest are up.
@@ -60,6 +60,8 @@ class Draft:
     def __post_init__(self) -> None:
         keep = functools.partial(object.__setattr__, self)  # frozen
         keep("threading", _groups("threading", self.threading, MOST_THREADS))
+        if not any(self.threading):
+            raise InputError("threading has no end on any shaft, must have at least one")
         if self.tieup is not None:
             keep("tieup", _groups("tieup", self.tieup, MOST_THREADS, least=0))
         treadles = MOST_THREADS if self.tieup is None else len(self.tieup)

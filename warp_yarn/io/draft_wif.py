@@ -133,14 +133,19 @@ class Reading:
     def _trodden(self) -> tuple[list[list[int]] | None, list[list[int]]]:
         """Finds the tie-up and treadling, which count where there is a liftplan too; or None and the liftplan."""
         picks = self._count("WEFT", "THREADS")
-        treadling, tied = self._any("TREADLING"), self._any("TIEUP")
+        treadling, tied, lifted = (self._any(section, "0") for section in ("TREADLING", "TIEUP", "LIFTPLAN"))
+        if not (treadling and tied) and not lifted:
+            # nothing moves; is that what it says?
+            treadling, tied, lifted = (self._any(section) for section in ("TREADLING", "TIEUP", "LIFTPLAN"))
+            if lifted or (treadling and tied):
+                self.told.append("no pick moves a shaft")
         if treadling and tied:
             # Fiberworks ties up treadles beyond the last that it counts
             tieup = self._groups("TIEUP", None)
             most = max(len(tieup), self._count("WEAVING", "TREADLES") or 0)
             tieup += [[] for _ in range(most - len(tieup))]
             return tieup, self._groups("TREADLING", picks, most, "the last of [TIEUP] and of [WEAVING] Treadles")
-        if self._any("LIFTPLAN"):
+        if lifted:
             return None, self._groups("LIFTPLAN", picks)
         if not (treadling or tied):
             raise InputError(
@@ -149,9 +154,9 @@ class Reading:
         missing, there = ("TIEUP", "TREADLING") if treadling else ("TREADLING", "TIEUP")
         raise InputError(f"[{missing}] is missing or empty, which [{there}] needs")
 
-    def _any(self, section: str) -> bool:
-        """Tells whether a section says anything but none and 0."""
-        return any(value.strip("0, \t") for value in self.sections.get(section, {}).values())
+    def _any(self, section: str, but: str = "") -> bool:
+        """Tells whether a section says anything, at all, or but this."""
+        return any(value.strip(but + ", \t") for value in self.sections.get(section, {}).values())
 
     def _rising(self) -> bool:
         if self.rising is not None:
