@@ -207,7 +207,7 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
     record = str(tmp_path / "first.npz")
     hang.main(["--size", "5", "--steps", "1", "--output", str(usd), "--record", record])
     others = (["--fabric", "paper"], ["--wind", "0", "5", "0"], ["--wind", "1", "0", "0"], ["--locked"])
-    for option in (["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"], *others):
+    for option in (["--rows", "5"], ["--weave", "plain"], ["--draft", str(DRAFT)], ["--step", "1e-3"], *others):
         assert exit_code(hang, ["--resume", record, *option]) == 2
         assert option[0] in capsys.readouterr().err
 
