@@ -608,6 +608,17 @@ def test_a_cloth_is_dyed_as_the_draft_says():
         draft.dyed(draft)
 
 
+def test_distances_are_those_of_a_cloth():
+    draft = quiet(OWN / "tempoweave.wif")  # of 2.12 mm, but for the second end, of 4.24 mm
+    warp, weft = draft.spacing
+    # the last end first: the second end is the last row but one
+    np.testing.assert_allclose(warp, np.array([2.12, 2.12, 2.12, 3.18, 3.18]) * 1e-3, rtol=1e-15)
+    np.testing.assert_allclose(weft, np.full(4, 2.12e-3), rtol=1e-15)
+    assert quiet(OWN / "dbweave.wif").spacing is None
+    draft = quiet(OWN / "fiberworks.wif")
+    assert wy.Cloth(draft.weave, yarns=[wy.paper.YARNS[1]], spacing=draft.spacing).spacing == draft.spacing == 0.00212
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

@@ -151,6 +151,18 @@ class Draft:
         return moved if self.rising else ~moved
 
     @property
+    def spacing(self) -> float | tuple[np.ndarray, np.ndarray] | None:
+        """The distances of neighbouring yarns, as of a Cloth [m]: half of what each of the two takes up. One number where
+        all are the same, or those of its warp yarns [ends − 1] and weft yarns [picks − 1]; None: not known."""
+        if self.warp_spacing is None or self.weft_spacing is None:
+            return None
+        warp, weft = (0.5 * (widths[1:] + widths[:-1]) for widths in (self.warp_spacing, self.weft_spacing))
+        every = np.append(warp, weft)
+        if every.size and (every == every[0]).all():
+            return float(every[0])
+        return warp[::-1], weft  # the last end first, as of the weave
+
+    @property
     def weave(self) -> Weave:
         """Its weave, a warp yarn for each end, the last end first, and a weft yarn for each pick: see ``Weave``.
 
