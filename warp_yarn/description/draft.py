@@ -152,8 +152,8 @@ class Draft:
 
     @property
     def spacing(self) -> float | tuple[np.ndarray, np.ndarray] | None:
-        """The distances of neighbouring yarns, as of a Cloth [m]: half of what each of the two takes up. One number where
-        all are the same, or those of its warp yarns [ends − 1] and weft yarns [picks − 1]; None: not known."""
+        """The distances of neighbouring yarns, as of a Cloth [m]: half of what each of the two takes up. One number
+        where all are the same, or those of its warp yarns [ends − 1] and weft yarns [picks − 1]; None: not known."""
         if self.warp_spacing is None or self.weft_spacing is None:
             return None
         warp, weft = (0.5 * (widths[1:] + widths[:-1]) for widths in (self.warp_spacing, self.weft_spacing))
