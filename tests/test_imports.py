@@ -49,6 +49,7 @@ ONLY = {
     "stable_baselines3": set(),
     "pxr": {f"{W}.io.usd"},
     "h5py": {f"{W}.io.published"},
+    "dtx_to_wif": {f"{W}.io.draft"},
     "pyvista": set(),
     "scenes": set(),
     "benchmarks": set(),
@@ -154,6 +155,7 @@ def test_importing_the_package_loads_no_extra():
     extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
     extras |= {"gymnasium", "stable_baselines3"}
     assert not loaded & extras
+    assert "dtx_to_wif" not in loaded
 
 
 # -- the tests --------------------------------------------------------------------------------------------------------
