@@ -204,6 +204,16 @@ def test_the_choice_of_a_preconditioner_goes_by_the_stiffest_segment() -> None:
     assert wy.Simulator(wy.Scene(short), step=step).model.preconditioner == "multilevel"
 
 
+def test_contact_goes_by_the_thickest_yarn_and_the_longest_gap() -> None:
+    """So that no yarn of another layer finds a hole to pass through."""
+    scene = wy.Scene(cloth("general"), obstacles=[wy.Plane(point=(0, 0, -1), normal=(0, 0, 1))], self_contact=True)
+    arrays = wy.Simulator(scene).arrays
+    of = {name: float(arrays[name].numpy()[0]) for name in arrays if name.endswith(("contact_distance", "range"))}
+    assert of["contact_distance"] == of["contact_range"] == 3.2e-4
+    assert of["self_contact_distance"] == pytest.approx(1.5 * 1.4e-3)
+    assert of["self_contact_range"] == pytest.approx(1.4e-3)
+
+
 # -- gradients and learning ------------------------------------------------------------------------------------------
 
 INPUTS = (

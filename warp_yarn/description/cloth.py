@@ -100,7 +100,6 @@ class Cloth(Woven):
             raise InputError(f"yarns = {yarns!r}, must be a list of at least one Yarn")
         self.warp = checked_materials("warp", warp, weave.rows, len(self.yarns))
         self.weft = checked_materials("weft", weft, weave.columns, len(self.yarns))
-        self.material = np.concatenate([self.warp, self.weft])
         self.spacing = checked_spacing(spacing, weave.rows, weave.columns)
         self.radius = real("radius", radius, above=0.0)
         self.crimp = checked_crimp(crimp, weave.rows, weave.columns)
@@ -156,6 +155,11 @@ class Cloth(Woven):
     @functools.cached_property
     def topology(self) -> Topology:  # type: ignore[override]
         return rectangle(self.weave)
+
+    @property
+    def material(self) -> np.ndarray:  # type: ignore[override]
+        """Material of every yarn, the warp yarns first [rows + columns]."""
+        return np.concatenate([self.warp, self.weft])
 
     @property
     def stretch_stiffness(self) -> np.ndarray:
