@@ -600,6 +600,9 @@ def test_a_cloth_is_dyed_as_the_draft_says():
     two = draft.dyed(paper)
     assert [two.yarns[k].density for k in two.material] == [paper.yarns[k].density for k in paper.material]
     assert two.friction_damping == paper.friction_damping and two.spacing == paper.spacing
+    # numbers by pair of materials stay those of the same crossings
+    paired = paper.replace(shear=[[1.0, 2.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(draft.dyed(paired).at_nodes("shear"), paired.at_nodes("shear"))
     with pytest.raises(wy.InputError, match="has 8 warp and 6 weft yarns, must have 6 and 5"):
         quiet(OWN / "fiberworks.wif").dyed(cloth)
     with pytest.raises(wy.InputError, match="has no colors"):

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError, finite_array, integer
 from .cloth import Cloth
 from .weave import Weave
+from .woven import OF_CROSSINGS
 
 MOST_THREADS = 10_000
 """Ends, picks, shafts and treadles."""
@@ -213,7 +214,11 @@ class Draft:
         kinds, place = np.unique(np.column_stack([cloth.material, colors]), axis=0, return_inverse=True)
         place = place.ravel()  # NumPy 2.0 has it in two dimensions
         yarns = [dataclasses.replace(cloth.yarns[int(kind[0])], color=tuple(kind[1:].tolist())) for kind in kinds]
-        return cloth.replace(yarns=yarns, warp=place[: self.ends], weft=place[self.ends :])
+        before = kinds[:, 0].astype(int)
+        numbers = {name: cloth._arguments[name] for name in OF_CROSSINGS}
+        # by pair of materials
+        pairs = {name: value[np.ix_(before, before)] for name, value in numbers.items() if np.ndim(value) == 2}
+        return cloth.replace(yarns=yarns, warp=place[: self.ends], weft=place[self.ends :], **pairs)
 
 
 def _groups(name: str, groups: Any, most: int, least: int = 1) -> tuple[tuple[int, ...], ...]:
