@@ -13,10 +13,12 @@ import torch
 import warp_yarn.learn as wl
 from cases import GENERAL, cloth
 from inputs import EXACT, WIND, jittered, scaled
+from internals import numbers
 from reference import Oracle, tensor
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
+from warp_yarn.device import defaults
 
 YARN = wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4)
 PLAIN = wy.Weave.plain(rows=5, columns=6)
@@ -68,7 +70,7 @@ def test_numbers_that_are_all_the_same_are_one(options: dict) -> None:
     """And cost nothing: the kernels are those of a plain cloth."""
     c = wy.Cloth(PLAIN, **{"yarns": [YARN], "radius": 3e-4, **options})
     assert not c.general and c.spacing == 1e-3 and c.radius == 3e-4
-    assert wy.Simulator(wy.Scene(c)).arrays["spacing"].shape == (1,)
+    assert numbers(wy.Simulator(wy.Scene(c)), "spacing").shape == (1,)
     assert c.replace(pose="flat").radius == 3e-4
 
 
@@ -247,9 +249,9 @@ def test_the_choice_of_a_preconditioner_goes_by_the_stiffest_segment() -> None:
     """k_s h²/(m L): of one short gap among long ones."""
     soft = wy.Cloth(PLAIN, **SMALL, spacing=(1e-2, 1e-2 * np.linspace(1.0, 1.1, 5)), friction_damping=0.0)
     step = 1.7 * 1e-2 / math.sqrt(YARN.stretch * np.pi * 4e-8 / YARN.density)
-    assert wy.Simulator(wy.Scene(soft), step=step).model.preconditioner == "incomplete"
+    assert defaults.preconditioner(wy.Scene(soft), step) == "incomplete"
     short = soft.replace(spacing=(1e-2, [1e-2, 1e-3, 1e-2, 1e-2, 1e-2]))
-    assert wy.Simulator(wy.Scene(short), step=step).model.preconditioner == "multilevel"
+    assert defaults.preconditioner(wy.Scene(short), step) == "multilevel"
 
 
 def test_contact_goes_by_the_thickest_yarn_and_the_longest_gap() -> None:
