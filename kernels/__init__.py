@@ -23,6 +23,8 @@ from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, 
 from .terms import (
     applied_force,
     bending,
+    crimp_interchange,
+    crimped_contact,
     crossing_normal,
     friction,
     gravity,
@@ -41,6 +43,7 @@ _OWN = (
     inertia.INERTIA,
     inertia.MASS_RATE,
     stretch.TERM,
+    crimp_interchange.TERM,
     bending.TERM,
     gravity.TERM,
     jamming.TERM,
@@ -115,6 +118,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
     kernels = {
         "contact_normal": crossing_normal.define_normal(variant),
+        "crimped_contact_load": crimped_contact.define(variant),
         "update_anchor": friction.define_anchor(variant),
     }
     for term in _OWN:

@@ -13,7 +13,10 @@ from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
 from .cloth import Cloth, Fixed
 from .cloths import Cloths, as_one
+from .crimp import lacks_bending, lacks_crimp
 from .obstacles import Contact, Obstacle
+
+CONTACT_FORCES = ("published", "crimped")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,6 +65,11 @@ class Scene(Fixed):
         obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
         self_contact: whether the cloth may touch itself; else it passes through itself.
         contact: the law of contact; None: as ``Contact()``.
+        contact_force: what presses warp and weft together at a crossing: "published", eq. 3, whose stretch forces are
+            those of the straight segments; "crimped", of segments that rise by the crimp of the yarns, so that a flat
+            cloth's feels their tension.
+        crimp_interchange: whether yarns that are crimped straighten at each other's expense before they stretch: the
+            term of that name, in place of stretch, with a contact force of its own. Yarns must be crimped as woven.
     """
 
     def __init__(
@@ -81,6 +89,8 @@ class Scene(Fixed):
         obstacles: Sequence[Obstacle] = (),
         self_contact: bool = False,
         contact: Contact | None = None,
+        contact_force: str = "published",
+        crimp_interchange: bool = False,
     ):
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
@@ -105,6 +115,9 @@ class Scene(Fixed):
         if contact is not None and not isinstance(contact, Contact):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
+        self.contact_force = choice("contact_force", contact_force, CONTACT_FORCES)
+        self.crimp_interchange = bool(crimp_interchange)
+        self._check_crimp()
         self.terms = self._terms(terms)
         self._fix(
             cloth=self.cloth,
@@ -121,6 +134,8 @@ class Scene(Fixed):
             obstacles=self.obstacles,
             self_contact=self.self_contact,
             contact=contact,
+            contact_force=self.contact_force,
+            crimp_interchange=self.crimp_interchange,
         )
 
     def __repr__(self) -> str:
@@ -169,6 +184,8 @@ class Scene(Fixed):
             "parameters",
             "self_contact",
             "contact",
+            "contact_force",
+            "crimp_interchange",
         )
         return (
             self.cloth.same_as(other.cloth)
@@ -178,6 +195,19 @@ class Scene(Fixed):
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
+
+    def _check_crimp(self) -> None:
+        """Refuses what needs crimp that is not there."""
+        if self.crimp_interchange and self.contact_force == "crimped":
+            raise InputError(
+                "contact_force = 'crimped', must be 'published' with crimp_interchange, whose contact force is its own"
+            )
+        wanted = "crimp_interchange = True" if self.crimp_interchange else f"contact_force = {self.contact_force!r}"
+        crimped = self.crimp_interchange or self.contact_force == "crimped"
+        lacks = lacks_crimp(self.cloth) if crimped else ""
+        lacks = lacks or (lacks_bending(self.cloth) if self.crimp_interchange else "")
+        if lacks:
+            raise InputError(f"{wanted}, but {lacks}")
 
     def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
         if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):

@@ -221,6 +221,17 @@ CONTACT_INPUTS: Group = {
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
 
+CRIMP: Group = {
+    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
+    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
+    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
+    "crimp_yarns": Field("node", 2, "int", "", "crimp interchange", "its warp and its weft yarn"),
+    "set_angle": Field("yarn", 1, "scalar", "rad", "crimp interchange", "θ₀, slope of the yarn as woven"),
+    "set_length": Field("yarn", 1, "scalar", "m", "crimp interchange", "L₀, its length between crossings as woven"),
+    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
+}
+"""Of crimp interchange, and of the contact force at crimped positions. Others have none of it."""
+
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
     "increment": Field("node", 1, "vec3", "m/s", "always", "velocities whose momentum the right-hand side has"),
@@ -332,6 +343,8 @@ STAGE_ADJOINT: Group = {
 LAUNCH: Group = {
     "matrix": Field("launch", 1, "int", "", "always", "whether a term is to fill the matrix"),
     "add_contact_load": Field("launch", 1, "int", "", "always", "whether a term is to add to ``contact_load``"),
+    "stretches": Field("launch", 1, "int", "", "always", "whether the scene has stretch"),
+    "bends": Field("launch", 1, "int", "", "always", "whether the scene has bending"),
     "stage": Field("launch", 1, "int", "", "always", "which stage of the step, from 0"),
     "along": Field("launch", 1, "int", "", "always", "direction of lines: 0 warp, 1 weft"),
     "first": Field("launch", 1, "int", "", "always", "first node of a level"),
@@ -371,6 +384,7 @@ GROUPS: dict[str, Group] = {
     "Levels": LEVELS,
     "Contact": CONTACT,
     "ContactInputs": CONTACT_INPUTS,
+    "Crimp": CRIMP,
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,

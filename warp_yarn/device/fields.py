@@ -62,6 +62,8 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "forces change": len(scene.force_nodes) > 0 and len(scene.force_path) > 1,
         "obstacles": len(scene.obstacles) > 0,
         "obstacles move": any(obstacle.path is not None for obstacle in scene.obstacles),
+        "crimp interchange": "crimp_interchange" in names,
+        "crimped contact": scene.contact_force == "crimped",
         "self-contact": scene.self_contact,
     }
     return {name for name, value in holds.items() if value}

@@ -160,7 +160,7 @@ class Model:
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
-            self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
+            self.launch_term(term, matrix=filled, add_contact_load=self._presses(term), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def _find_normals(self) -> None:
@@ -168,14 +168,24 @@ class Model:
         if self.arrays.contact:
             self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
+            if self.scene.contact_force == "crimped":
+                names = self.scene.terms
+                self.launch("crimped_contact_load", "bends", stretches=int("stretch" in names), bends=int("bending" in names))
         self.contact.find()
+
+    def _presses(self, term: Term) -> int:
+        """Tells whether a term adds to the contact loads itself: the crimped ones have those of stretch and bending,
+        and crimp interchange has what bends the yarns there."""
+        crimped = self.scene.contact_force == "crimped" and term.name in ("stretch", "bending")
+        interchanged = "crimp_interchange" in self.scene.terms and term.name == "bending"
+        return int(self.arrays.contact and not crimped and not interchanged)
 
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
         a = self.arrays
         self._find_normals()
         for term in a.terms:
-            if a.contact and term.presses:
+            if term.presses and self._presses(term):
                 # the forces go where the solver works
                 unused = {"force": a["q_x"], "euler_force": a["q_s"]}
                 self.launch_term(term, matrix=0, add_contact_load=1, **unused)

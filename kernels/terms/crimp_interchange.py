@@ -1,0 +1,477 @@
+"""Crimp interchange: yarns that are crimped round each other, and straighten each other's expense before they stretch.
+
+At a crossing warp and weft have heights h₁ and h₂, from one extreme of a yarn's axis to the other. They touch, so
+
+    h₁ + h₂ = d₁ + d₂
+
+and h = h₁ is an unknown of the crossing. Of a segment between crossings p = |x_b − x_a| is its length in the plane of
+the cloth, Δs that of its yarn, which is a thread of length ℓ that rises by h at a slope of θ:
+
+    ℓ = √(p² + (β h)²),   tan θ = β h / p,   β² = 9/8
+    V = kₛ max(0, ℓ − Δs)²/(2Δs) + 6 k_b r²/Δs³,   r = β h cos θ₀ − p sin θ₀
+
+β makes h = (4/3) p √c of a crimp c = ℓ/p − 1, as Peirce has it for yarns that are round at their bends (a thread of
+straight pieces would have √2). The second part is what it takes to bend a yarn of length Δs, held at both ends, by r
+across itself; it is set at the angle θ₀ it was woven at. In place of ``stretch`` a crossing has half of V of each of
+its four segments, at its own height:
+
+    W = min over h of ½ Σ V(p, h₁ or h₂, Δs)
+
+V is convex in p, h and Δs (but for how r²/Δs³ depends on Δs), so there is one h, and W is as convex. A yarn is slack
+where ℓ < Δs: it does not push, but bends. A segment that ends on the border has the height of its crossing at both
+ends. Straight ones, on border yarns and between crossings where a yarn stays on one side (floats), keep their crimp:
+V = ½ kₛ Δs (p/(Δs cos θ₀) − 1)².
+
+The contact force is what it takes to hold h₁ + h₂, and half of n·(F of the warp − F of the weft) as of ``stretch``.
+
+Parameters: ``stretch`` Y [Pa]; ``bend`` B [Pa m²]; ``radius`` R [m], of which d₁ + d₂; θ₀ of each yarn as woven.
+
+h comes of Newton's iteration between bounds, and then of one more step whose derivative is the implicit function
+theorem's, so that reverse mode differentiates through it. The matrix is the exact second derivative of W in the
+positions, without compression across segments. Where yarns slide, positions are coupled to four coordinates that the
+matrix has no place for: it is then that of the positions, and that of (u, v) with h held, twice each, which is never
+less than the whole.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..core.indexing import index
+from ..core.structs import structs
+from ..core.variant import Term, Variant
+from . import bending, stretch
+
+ROUND = 9.0 / 8.0
+"""β²."""
+BUCKLING = 0.25
+"""The most that a yarn carries in compression, in 12 k_b cos²θ₀/L₀²: a third of it is where h would have two values in
+a segment that is squeezed to a third of its yarn's length."""
+MOST_STEPS = 60
+SETTLED = {wp.float64: 1e-13, wp.float32: 1e-5}
+"""Part of d₁ + d₂ that the last step of Newton's iteration may change h by: the one after it squares that."""
+
+
+@functools.cache
+def functions(variant: Variant) -> SimpleNamespace:
+    scalar = variant.scalar
+    vec2, vec3, vec4 = wp.types.vector(2, scalar), variant.vec3, variant.vec4
+
+    @wp.func
+    def crimp_length(p: scalar, h: scalar) -> scalar:
+        """Compute ℓ, never 0."""
+        return wp.sqrt(p * p + scalar(wp.static(ROUND)) * h * h + scalar(1.0e-30))
+
+    @wp.func
+    def crimp_offset(p: scalar, h: scalar, angle: scalar) -> scalar:
+        """Compute r."""
+        return scalar(wp.static(ROUND**0.5)) * h * wp.cos(angle) - p * wp.sin(angle)
+
+    @wp.func
+    def crimp_tension(strain: scalar, k: scalar, most: scalar) -> vec3:
+        """Compute (∫T, T, T') of a strain: kₛ times it, and in compression never as much as ``most``."""
+        if strain >= scalar(0.0):
+            return vec3(scalar(0.5) * k * strain * strain, k * strain, k)
+        y = -k * strain / most
+        by = scalar(1.0) / (scalar(1.0) + y)
+        return vec3(most * most / k * (y + wp.log(by)), k * strain * by, k * by * by)
+
+    @wp.func
+    def crimp_energy(p: scalar, h: scalar, rest: scalar, k: scalar, b: scalar, angle: scalar) -> scalar:
+        """Compute V of a crimped segment."""
+        cosine = wp.cos(angle)
+        pull = crimp_tension(crimp_length(p, h) / rest - scalar(1.0), k, scalar(BUCKLING) * b * cosine * cosine)
+        r = crimp_offset(p, h, angle)
+        return rest * pull[0] + scalar(0.5) * b * r * r / rest
+
+    @wp.func
+    def crimp_slopes(p: scalar, h: scalar, rest: scalar, k: scalar, b: scalar, angle: scalar) -> vec3:
+        """Compute the derivatives of V by p, h and Δs."""
+        cosine = wp.cos(angle)
+        length = crimp_length(p, h)
+        pull = crimp_tension(length / rest - scalar(1.0), k, scalar(BUCKLING) * b * cosine * cosine)
+        r = crimp_offset(p, h, angle) / rest
+        return vec3(
+            pull[1] * p / length - b * r * wp.sin(angle),
+            pull[1] * scalar(wp.static(ROUND)) * h / length + b * r * scalar(wp.static(ROUND**0.5)) * cosine,
+            pull[0] - pull[1] * length / rest - scalar(0.5) * b * r * r,
+        )
+
+    @wp.func
+    def crimp_curvature(p: scalar, h: scalar, rest: scalar, k: scalar, b: scalar, angle: scalar):
+        """Compute the second derivatives of V without what is negative: pp, ph, hh, that by Δs twice, and what hh has
+        to be added to be exact."""
+        cosine = wp.cos(angle)
+        length = crimp_length(p, h)
+        pull = crimp_tension(length / rest - scalar(1.0), k, scalar(BUCKLING) * b * cosine * cosine)
+        stiff = b / rest
+        g_p = -wp.sin(angle)
+        g_h = scalar(wp.static(ROUND**0.5)) * cosine
+        r = crimp_offset(p, h, angle) / rest
+        along = pull[2] / rest
+        n_p = p / length
+        n_h = scalar(wp.static(ROUND)) * h / length
+        turned = scalar(wp.static(ROUND)) / (length * length * length)
+        bent = wp.max(pull[1], scalar(0.0)) * turned
+        pp = stiff * g_p * g_p + along * n_p * n_p + bent * h * h
+        ph = stiff * g_p * g_h + along * n_p * n_h - bent * h * p
+        hh = stiff * g_h * g_h + along * n_h * n_h + bent * p * p
+        rest_rest = stiff * r * r + along * length * length / (rest * rest)
+        return pp, ph, hh, rest_rest, wp.min(pull[1], scalar(0.0)) * turned * p * p
+
+    @wp.func
+    def straight_slopes(p: scalar, rest: scalar, k: scalar, angle: scalar) -> vec3:
+        """Compute the derivatives of V of a straight segment, by p, h and Δs."""
+        by_cosine = scalar(1.0) / wp.cos(angle)
+        ratio = p * by_cosine / rest
+        return vec3(
+            k * (ratio - scalar(1.0)) * by_cosine,
+            scalar(0.0),
+            scalar(-0.5) * k * (ratio * ratio - scalar(1.0)),
+        )
+
+    @wp.func
+    def height_slope(
+        h: scalar, total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2
+    ) -> scalar:
+        """Compute ∂W/∂h at a height."""
+        result = scalar(0.0)
+        for side in range(4):
+            if parts[side] > scalar(0.0):
+                if side < 2:
+                    result += parts[side] * crimp_slopes(p[side], h, rest[side], k[0], b[0], angle[0])[1]
+                else:
+                    result -= parts[side] * crimp_slopes(p[side], total - h, rest[side], k[1], b[1], angle[1])[1]
+        return result
+
+    @wp.func
+    def solve_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2) -> vec2:
+        """Find the h that makes W least, and 1/W'' there; (½ total, 0) where no segment depends on it.
+
+        Beyond what a yarn was set to, and beyond h₁ + h₂ of the other, W rises outwards: these are the bounds.
+        """
+        low = scalar(0.0)
+        high = total
+        most = scalar(0.0)
+        for side in range(4):
+            most = wp.max(most, parts[side])
+            if parts[side] > scalar(0.0):
+                if side < 2:
+                    high = wp.max(high, p[side] * wp.tan(angle[0]) * scalar(wp.static(ROUND**-0.5)))
+                else:
+                    low = wp.min(low, total - p[side] * wp.tan(angle[1]) * scalar(wp.static(ROUND**-0.5)))
+        h = scalar(0.5) * total
+        if most == scalar(0.0):
+            return vec2(h, scalar(0.0))
+        by_curvature = scalar(0.0)
+        for _step in range(int(MOST_STEPS)):
+            slope = height_slope(h, total, p, rest, parts, k, b, angle)
+            curvature = scalar(0.0)
+            for side in range(4):
+                if parts[side] > scalar(0.0):
+                    mine = h
+                    yarn = side / 2
+                    if side > 1:
+                        mine = total - h
+                    _pp, _ph, hh, _rr, less = crimp_curvature(
+                        p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn]
+                    )
+                    curvature += parts[side] * wp.max(hh + less, scalar(0.1) * hh)
+            by_curvature = scalar(1.0) / curvature
+            if slope > scalar(0.0):
+                high = h
+            else:
+                low = h
+            after = h - slope * by_curvature
+            if after <= low or after >= high:
+                after = scalar(0.5) * (low + high)
+            change = wp.abs(after - h)
+            h = after
+            if change <= scalar(wp.static(SETTLED[scalar])) * total:
+                break
+        return vec2(h, by_curvature)
+
+    @wp.func_grad(solve_height)
+    def adj_solve_height(
+        total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2, adj_ret: vec2
+    ):
+        """Reverse it: as if it were a number, for crimp_height has the derivative."""
+        wp.adjoint[total] += scalar(0.0)
+
+    @wp.func
+    def crimp_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2) -> scalar:
+        """Find h. With the W'' of the solve held, the derivative of this one step is −(∂²W/∂h∂y)/W'' in all y."""
+        solved = solve_height(total, p, rest, parts, k, b, angle)
+        return solved[0] - solved[1] * height_slope(solved[0], total, p, rest, parts, k, b, angle)
+
+    return SimpleNamespace(
+        energy=crimp_energy,
+        slopes=crimp_slopes,
+        straight=straight_slopes,
+        curvature=crimp_curvature,
+        height=crimp_height,
+    )
+
+
+@functools.cache
+def around(variant: Variant) -> SimpleNamespace:
+    """Make the functions that look at a node and its four segments."""
+    scalar, vec3 = variant.scalar, variant.vec3
+    vec2, vec4 = wp.types.vector(2, scalar), variant.vec4
+    Crimp = structs(variant).Crimp
+    stretch_stiffness, bend_stiffness = stretch.functions(variant).stiffness, bending.functions(variant).stiffness
+
+    @wp.func
+    def diameters(radius: wp.array(dtype=scalar), warp: int, weft: int) -> scalar:
+        """Compute d₁ + d₂ of two yarns."""
+        return scalar(4.0) * radius[0]
+
+    @wp.func
+    def beam_stiffness(k_b: scalar, length: scalar) -> scalar:
+        """Compute 12 k_b/L₀² [N]."""
+        return scalar(12.0) * k_b / (length * length)
+
+    @wp.func
+    def yarns_of(
+        crimp: Crimp,
+        i: int,
+        stretch: wp.array(dtype=scalar),
+        bend: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+    ):
+        """Compute kₛ, 12 k_b/L₀² and θ₀ of the warp and the weft yarn of a node, and d₁ + d₂."""
+        warp = index(crimp.crimp_yarns[2 * i])
+        weft = index(crimp.crimp_yarns[2 * i + 1])
+        k = vec2(stretch_stiffness(stretch[warp], radius[0]), stretch_stiffness(stretch[weft], radius[0]))
+        b = vec2(
+            beam_stiffness(bend_stiffness(bend[warp], radius[0]), crimp.set_length[warp]),
+            beam_stiffness(bend_stiffness(bend[weft], radius[0]), crimp.set_length[weft]),
+        )
+        return k, b, vec2(crimp.set_angle[warp], crimp.set_angle[weft]), diameters(radius, warp, weft)
+
+    @wp.func
+    def segments_of(crimp: Crimp, i: int, position: wp.array(dtype=vec3), euler: wp.array(dtype=scalar)):
+        """Compute p and Δs of the segments left, right, up and down of a node, and the part of each that is its own
+        and crimped, 0 of others."""
+        p = vec4()
+        rest = vec4()
+        parts = vec4()
+        for side in range(4):
+            p[side] = scalar(1.0)
+            rest[side] = scalar(1.0)
+            if crimp.crimp_sides[i][side] != 0:
+                at = index(crimp.crimp_around[i][side])
+                s = side / 2
+                p[side] = wp.length(position[at] - position[i])
+                rest[side] = wp.abs(euler[2 * at + s] - euler[2 * i + s])
+                parts[side] = wp.max(scalar(0.5) * scalar(crimp.crimp_sides[i][side]), scalar(0.0))
+        return p, rest, parts
+
+    return SimpleNamespace(yarns=yarns_of, segments=segments_of)
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    vec4, mat44 = variant.vec4, wp.types.matrix((4, 4), variant.scalar)
+    BlockMatrix, Crimp = structs(variant).BlockMatrix, structs(variant).Crimp
+    f, near = functions(variant), around(variant)
+    crimp_height, crimp_slopes, straight_slopes, crimp_curvature = f.height, f.slopes, f.straight, f.curvature
+    yarns_of, segments_of = near.yarns, near.segments
+
+    @wp.func
+    def add_matrix(
+        crimp: Crimp,
+        i: int,
+        position: wp.array(dtype=vec3),
+        blocks: BlockMatrix,
+        c: mat44,
+        across: vec4,
+        of_rest: vec4,
+    ):
+        """Add the blocks of a node's segments: c, second derivatives by their lengths; across, those across each; of
+        their Δs."""
+        all = wp.identity(n=3, dtype=scalar) * scalar(0.0)
+        for k in range(4):
+            if crimp.crimp_sides[i][k] != 0:
+                at = index(crimp.crimp_around[i][k])
+                direction = k / 2
+                t = wp.normalize(position[at] - position[i])
+                bare = wp.identity(n=3, dtype=scalar) * across[k] - wp.outer(t, t) * across[k]
+                with_node = bare * scalar(1.0)
+                for m in range(4):
+                    if c[k, m] != scalar(0.0):
+                        other = index(crimp.crimp_around[i][m])
+                        block = wp.outer(t, wp.normalize(position[other] - position[i])) * c[k, m]
+                        with_node += block
+                        if k == m:
+                            wp.atomic_add(blocks.diagonal_xx, at, block + bare)
+                        elif k < m:
+                            if k / 2 == m / 2:
+                                wp.atomic_add(
+                                    blocks.upper_xx, index(blocks.stencil * at + 2 + direction), block
+                                )
+                            else:
+                                slot = index(crimp.crimp_corners[i][2 * k + m - 2])
+                                if m == 2:
+                                    # the one above comes before the ones beside
+                                    wp.atomic_add(blocks.upper_xx, slot, wp.transpose(block))
+                                else:
+                                    wp.atomic_add(blocks.upper_xx, slot, block)
+                all += with_node
+                if k % 2 == 0:
+                    wp.atomic_add(blocks.upper_xx, index(blocks.stencil * at + direction), -with_node)
+                else:
+                    wp.atomic_add(blocks.upper_xx, index(blocks.stencil * i + direction), -wp.transpose(with_node))
+                if wp.static(sliding):
+                    wp.atomic_add(blocks.diagonal_ss, 2 * at + direction, of_rest[k])
+                    wp.atomic_add(blocks.diagonal_ss, 2 * i + direction, of_rest[k])
+                    if k % 2 == 0:
+                        wp.atomic_add(blocks.upper_ss, 4 * at + direction, -of_rest[k])
+                    else:
+                        wp.atomic_add(blocks.upper_ss, 4 * i + direction, -of_rest[k])
+        wp.atomic_add(blocks.diagonal_xx, i, all)
+
+    @variant.kernel("crimp")
+    def crimp_interchange_term(
+        # topology and shape
+        crimp: Crimp,
+        # parameters
+        stretch: wp.array(dtype=scalar),
+        bend: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+        # state in
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vec3),
+        # forces out
+        force: wp.array(dtype=vec3),
+        euler_force: wp.array(dtype=scalar),
+        add_contact_load: int,
+        contact_load: wp.array(dtype=scalar),
+        # matrix out
+        matrix: int,
+        blocks: BlockMatrix,
+    ):
+        i = index(wp.tid())
+        k, b, angle, total = yarns_of(crimp, i, stretch, bend, radius)
+        p, rest, parts = segments_of(crimp, i, position, euler)
+        h = crimp_height(total, p, rest, parts, k, b, angle)
+        for side in range(4):
+            code = crimp.crimp_sides[i][side]
+            if code != 0:
+                at = index(crimp.crimp_around[i][side])
+                direction = side / 2
+                mine = h
+                if side > 1:
+                    mine = total - h
+                part = scalar(0.5) * wp.abs(scalar(code))
+                slopes = straight_slopes(p[side], rest[side], k[direction], angle[direction])
+                if code > 0:
+                    slopes = crimp_slopes(p[side], mine, rest[side], k[direction], b[direction], angle[direction])
+                f = wp.normalize(position[at] - position[i]) * (part * slopes[0])
+                wp.atomic_add(force, i, f)
+                wp.atomic_add(force, at, -f)
+                if add_contact_load != 0:
+                    half = scalar(0.5) - scalar(direction)
+                    wp.atomic_add(contact_load, i, half * wp.dot(normal[i], f) + part * slopes[1])
+                    wp.atomic_add(contact_load, at, -half * wp.dot(normal[at], f))
+                if wp.static(sliding):
+                    f_s = part * slopes[2]
+                    if side % 2 == 0:
+                        f_s = -f_s
+                    wp.atomic_add(euler_force, 2 * i + direction, f_s)
+                    wp.atomic_add(euler_force, 2 * at + direction, -f_s)
+
+        if matrix != 0:
+            factor = blocks.coefficients[0][2]
+            if wp.static(sliding):
+                factor *= scalar(2.0)
+            c = mat44()
+            across = vec4()
+            of_rest = vec4()
+            coupling = vec4()
+            curvature = scalar(0.0)
+            for side in range(4):
+                code = crimp.crimp_sides[i][side]
+                if code != 0:
+                    yarn = side / 2
+                    part = scalar(0.5) * wp.abs(scalar(code)) * factor
+                    if code > 0:
+                        mine = h
+                        sign = scalar(1.0)
+                        if side > 1:
+                            mine = total - h
+                            sign = scalar(-1.0)
+                        slopes = crimp_slopes(p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn])
+                        pp, ph, hh, rr, _less = crimp_curvature(
+                            p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn]
+                        )
+                        c[side, side] = part * pp
+                        coupling[side] = sign * part * ph
+                        curvature += part * hh
+                        of_rest[side] = part * rr
+                        across[side] = part * wp.max(slopes[0], scalar(0.0)) / wp.max(p[side], scalar(1.0e-12))
+                    else:
+                        slopes = straight_slopes(p[side], rest[side], k[yarn], angle[yarn])
+                        by_cosine = scalar(1.0) / wp.cos(angle[yarn])
+                        ratio = p[side] * by_cosine / rest[side]
+                        c[side, side] = part * k[yarn] / rest[side] * by_cosine * by_cosine
+                        of_rest[side] = part * k[yarn] / rest[side] * ratio * ratio
+                        across[side] = part * wp.max(slopes[0], scalar(0.0)) / wp.max(p[side], scalar(1.0e-12))
+            if curvature > scalar(0.0):
+                for row in range(4):
+                    for column in range(4):
+                        c[row, column] = c[row, column] - coupling[row] * coupling[column] / curvature
+            add_matrix(crimp, i, position, blocks, c, across, of_rest)
+
+    return crimp_interchange_term
+
+
+def define_energy(variant: Variant) -> wp.Kernel:
+    scalar, vec3 = variant.scalar, variant.vec3
+    Crimp = structs(variant).Crimp
+    f, near = functions(variant), around(variant)
+    crimp_height, crimp_energy = f.height, f.energy
+    yarns_of, segments_of = near.yarns, near.segments
+
+    @variant.kernel("crimp")
+    def crimp_interchange_energy(
+        crimp: Crimp,
+        stretch: wp.array(dtype=scalar),
+        bend: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+        energy: wp.array(dtype=scalar),
+    ):
+        i = index(wp.tid())
+        k, b, angle, total = yarns_of(crimp, i, stretch, bend, radius)
+        p, rest, parts = segments_of(crimp, i, position, euler)
+        h = crimp_height(total, p, rest, parts, k, b, angle)
+        for side in range(4):
+            code = crimp.crimp_sides[i][side]
+            if code != 0:
+                yarn = side / 2
+                mine = h
+                if side > 1:
+                    mine = total - h
+                v = crimp_energy(p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn])
+                if code < 0:
+                    strain = p[side] / (rest[side] * wp.cos(angle[yarn])) - scalar(1.0)
+                    v = scalar(0.5) * k[yarn] * rest[side] * strain * strain
+                wp.atomic_add(energy, 0, scalar(0.5) * wp.abs(scalar(code)) * v)
+
+    return crimp_interchange_energy
+
+
+TERM = Term(
+    name="crimp_interchange",
+    elements="nodes",
+    define=define,
+    energy=define_energy,
+    absent=lambda scene: "" if scene.crimp_interchange else "crimp_interchange is False",
+    stencil=6,
+    presses=True,
+    energy_watched_as="elastic_energy",
+)
