@@ -20,7 +20,7 @@ import warp_yarn as wy
 
 RIGHT = 0.5 * math.pi
 TERMS = (
-    "inertia", "mass_rate", "stretch", "bending", "gravity", "parallel", "shear", "wind", "pins", "applied", "friction",
+    "inertia", "mass_rate", "stretch", "crimp_interchange", "bending", "gravity", "parallel", "shear", "wind", "pins", "applied", "friction",
 )  # fmt: skip
 
 Tensor = torch.Tensor
@@ -117,6 +117,55 @@ def bending(q: Tensor, k: Tensor, spacing: float) -> Tensor:
     """q = (x_a, x_c, x_b, s_a, s_b)."""
     e1, e2 = q[6:9] - q[3:6], q[0:3] - q[3:6]
     return faded(k * angle_squared(unit(e1), -unit(e2)), k * math.pi**2, e1, e2, spacing) / (q[10] - q[9])
+
+
+def crimped_segment(p: Tensor, h: Tensor, rest: Tensor, k: Tensor, b: Tensor, woven: Tensor) -> Tensor:
+    """Energy of a segment that rises by h; woven = (distance, length) as woven."""
+    cosine = woven[0] / woven[1]
+    sine = torch.sqrt(1.0 - cosine**2)
+    strain = torch.sqrt(p**2 + 9.0 / 8.0 * h**2) / rest - 1.0
+    beam = 12.0 * b / woven[1] ** 2
+    limit = 0.25 * beam * cosine**2
+    y = k * torch.clamp(-strain, min=0.0) / limit
+    pull = torch.where(strain > 0.0, 0.5 * k * strain**2, limit**2 / k * (y - torch.log1p(y)))
+    off = math.sqrt(9.0 / 8.0) * h * cosine - p * sine
+    return rest * pull + 0.5 * beam * off**2 / rest
+
+
+def crimped_crossing(q: Tensor, parts: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor) -> Tensor:
+    """q = (x of the crossing and left, right, up, down of it, their u, their v); parts of the four segments that are
+    crimped; k, b [2] and woven [2, 2] of warp and weft."""
+    x, u, v = q[:15].reshape(5, 3), q[15:20], q[20:25]
+    p = torch.linalg.vector_norm(x[1:] - x[0], dim=1)
+    rest = torch.stack([u[0] - u[1], u[2] - u[0], v[0] - v[3], v[4] - v[0]])
+
+    def energy(h: Tensor, p: Tensor, rest: Tensor) -> Tensor:
+        heights = torch.stack([h, h, total - h, total - h])
+        each = vmap(crimped_segment)(
+            p, heights, rest, k.repeat_interleave(2), b.repeat_interleave(2), woven.repeat_interleave(2, 0)
+        )
+        return (parts * each).sum()
+
+    slope = grad(energy)
+    low, high = -3.0 * total, 4.0 * total
+    fixed = p.detach(), rest.detach()
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = slope(middle, *fixed) > 0.0
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    h = (0.5 * (low + high)).detach()
+    # every step of Newton's iteration makes another derivative exact
+    for _ in range(2):
+        curvature = grad(slope)(h, p, rest)
+        h = h - torch.where(curvature > 0.0, slope(h, p, rest) / torch.where(curvature > 0.0, curvature, 1.0), 0.0)
+    return energy(h, p, rest)
+
+
+def straight_segment(q: Tensor, k: Tensor, part: Tensor, woven: Tensor) -> Tensor:
+    """As stretch, of a yarn that keeps its crimp."""
+    rest = q[7] - q[6]
+    strain = torch.linalg.vector_norm(q[3:6] - q[0:3]) / rest * woven[1] / woven[0] - 1.0
+    return part * 0.5 * k * rest * strain**2
 
 
 def lock(phi: Tensor, spacing: float, radius: float) -> Tensor:
@@ -285,11 +334,49 @@ class Oracle:
         local = functools.partial(bending, spacing=cloth.spacing)
         self.bending = Elements(torch.tensor(unknowns), local, (tensor(k),))
 
+        self._build_crimp()
         nodes = [int(node) for node in scene.pins]
         k = tensor([scene.pin_stiffness] * len(nodes))
         self.pins = Elements(
             torch.tensor([self.unknowns(node) for node in nodes]), pin, (k, tensor(cloth.position[nodes]))
         )
+
+    def woven(self, direction: int) -> list[float]:
+        """Distance of crossings, and length of yarn between them, as woven in a regular grid."""
+        x, to = self.cloth.position, (self.node(0, 1), self.node(1, 0))[direction]
+        return [math.dist(x[0].tolist(), x[to].tolist()), self.cloth.spacing]
+
+    def _build_crimp(self) -> None:
+        unknowns, parts, k, b, straight, its = [], [], [], [], [], []
+        wanted = []
+        woven = [self.woven(0), self.woven(1)]
+
+        def inside(j: int, i: int) -> bool:
+            return 0 < j < self.rows - 1 and 0 < i < self.columns - 1
+
+        for j, i in self.crossings():
+            near = [(j, i - 1), (j, i + 1), (j - 1, i), (j + 1, i)]
+            nodes = [self.node(j, i), *(self.node(*at) for at in near)]
+            unknowns.append(
+                [*self.unknowns(*nodes), *(self.slide(n, 0) for n in nodes), *(self.slide(n, 1) for n in nodes)]
+            )
+            parts.append(
+                [1.0 if not inside(*at) else 0.5 * (self.flipped[at[0]][at[1]] != self.flipped[j][i]) for at in near]
+            )
+            k.append([yarn.stretch * self.area for yarn in (self.warp[j], self.weft[i])])
+            b.append([yarn.bend * self.area for yarn in (self.warp[j], self.weft[i])])
+        for (a, c), direction, yarn in self.chains(2):
+            floats = inside(*a) and inside(*c) and self.flipped[a[0]][a[1]] == self.flipped[c[0]][c[1]]
+            wanted.append(float(floats or not (inside(*a) or inside(*c))))
+            straight.append(yarn.stretch * self.area)
+            its.append(woven[direction])
+        each = len(parts)
+        self.interchange = Elements(
+            torch.tensor(unknowns),
+            crimped_crossing,
+            (tensor(parts), tensor(k), tensor(b), tensor([woven] * each), tensor([4.0 * self.cloth.radius] * each)),
+        )
+        self.straight = self._segments(straight_segment, straight, wanted, its)
 
     def shear(self, contact_force: Tensor) -> Elements:
         """F_n of every node is held."""
@@ -361,6 +448,9 @@ class Oracle:
         result = force(q, v, anchor) if force else getattr(self, term).force(q)
         x, s = result[: 3 * self.nodes], result[3 * self.nodes :]
         return torch.cat([x, s * self.slides])
+
+    def _crimp_interchange_force(self, q: Tensor, *_: Tensor) -> Tensor:
+        return self.interchange.force(q) + self.straight.force(q)
 
     def _shear_force(self, q: Tensor, *_: Tensor) -> Tensor:
         return self.shear(self.contact(q)[1]).force(q)

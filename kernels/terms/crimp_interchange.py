@@ -1,36 +1,38 @@
-"""Crimp interchange: yarns that are crimped round each other, and straighten each other's expense before they stretch.
+"""Crimp interchange: yarns that are crimped round each other straighten at each other's expense before they stretch.
 
 At a crossing warp and weft have heights h₁ and h₂, from one extreme of a yarn's axis to the other. They touch, so
 
     h₁ + h₂ = d₁ + d₂
 
 and h = h₁ is an unknown of the crossing. Of a segment between crossings p = |x_b − x_a| is its length in the plane of
-the cloth, Δs that of its yarn, which is a thread of length ℓ that rises by h at a slope of θ:
+the cloth, Δs that of its yarn, which is a thread of length ℓ that rises by h:
 
-    ℓ = √(p² + (β h)²),   tan θ = β h / p,   β² = 9/8
-    V = kₛ max(0, ℓ − Δs)²/(2Δs) + 6 k_b r²/Δs³,   r = β h cos θ₀ − p sin θ₀
+    ℓ = √(p² + (β h)²),   ε = ℓ/Δs − 1,   r = β h cos θ₀ − p sin θ₀,   β² = 9/8
+    V = Δs ψ(ε) + ½ b r²/Δs,   ψ' = T = kₛ ε,  and kₛ ε/(1 − kₛ ε/T_b) where ε < 0,   b = 12 k_b/L₀²,   T_b = ¼ b cos²θ₀
 
-β makes h = (4/3) p √c of a crimp c = ℓ/p − 1, as Peirce has it for yarns that are round at their bends (a thread of
-straight pieces would have √2). The second part is what it takes to bend a yarn of length Δs, held at both ends, by r
-across itself; it is set at the angle θ₀ it was woven at. In place of ``stretch`` a crossing has half of V of each of
-its four segments, at its own height:
+β makes h = (4/3) p √c of a crimp c = ℓ/p − 1, as Peirce has it for yarns that are round at their bends (straight pieces
+would have √2). T is the tension: a yarn that is pushed gives way beyond T_b, which it resists by bending. The second
+part is what it takes to bend a yarn, held at both ends, by r across itself; it is set at the slope θ₀ and the length L₀
+that it was woven with. In place of ``stretch`` a crossing has half of V of each of its four segments, at its own height:
 
     W = min over h of ½ Σ V(p, h₁ or h₂, Δs)
 
-V is convex in p, h and Δs (but for how r²/Δs³ depends on Δs), so there is one h, and W is as convex. A yarn is slack
-where ℓ < Δs: it does not push, but bends. A segment that ends on the border has the height of its crossing at both
-ends. Straight ones, on border yarns and between crossings where a yarn stays on one side (floats), keep their crimp:
-V = ½ kₛ Δs (p/(Δs cos θ₀) − 1)².
+In tension V is convex in (p, h, Δs), and so is W, and there is one h; pushed, while ℓ > Δs/4. A segment that ends on
+the border has the height of its crossing at both ends. Straight ones, on border yarns and between crossings where a
+yarn stays on one side (floats), keep their crimp: V = ½ kₛ Δs (p/(Δs cos θ₀) − 1)².
 
 The contact force is what it takes to hold h₁ + h₂, and half of n·(F of the warp − F of the weft) as of ``stretch``.
 
-Parameters: ``stretch`` Y [Pa]; ``bend`` B [Pa m²]; ``radius`` R [m], of which d₁ + d₂; θ₀ of each yarn as woven.
+Parameters: ``stretch`` Y [Pa]; ``bend`` B [Pa m²]; ``radius`` R [m], for d₁ + d₂ too; θ₀ and L₀ of each yarn as woven.
 
-h comes of Newton's iteration between bounds, and then of one more step whose derivative is the implicit function
-theorem's, so that reverse mode differentiates through it. The matrix is the exact second derivative of W in the
-positions, without compression across segments. Where yarns slide, positions are coupled to four coordinates that the
-matrix has no place for: it is then that of the positions, and that of (u, v) with h held, twice each, which is never
-less than the whole.
+h comes of Newton's iteration between bounds, and of one more step whose derivative is that of the implicit function
+theorem, so that reverse mode differentiates through it.
+
+The matrix is the exact second derivative of W in the positions, without what compression takes away. Where yarns slide
+warp and weft are coupled through h by four coordinates that the matrix has no place for. Every other evaluation has
+the coupling within each yarn alone, which is never less than half of the exact matrix; those between have that of the
+positions, with Δs held. Newton's iteration needs both: in the one a cloth that draws in is too stiff, in the other a
+yarn that slides.
 """
 
 import functools
@@ -48,6 +50,8 @@ ROUND = 9.0 / 8.0
 BUCKLING = 0.25
 """The most that a yarn carries in compression, in 12 k_b cos²θ₀/L₀²: a third of it is where h would have two values in
 a segment that is squeezed to a third of its yarn's length."""
+HELD = 10.0
+"""How much stiffer Δs are in the matrix of the positions: they are left for the other one to move."""
 MOST_STEPS = 60
 SETTLED = {wp.float64: 1e-13, wp.float32: 1e-5}
 """Part of d₁ + d₂ that the last step of Newton's iteration may change h by: the one after it squares that."""
@@ -100,8 +104,8 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def crimp_curvature(p: scalar, h: scalar, rest: scalar, k: scalar, b: scalar, angle: scalar):
-        """Compute the second derivatives of V without what is negative: pp, ph, hh, that by Δs twice, and what hh has
-        to be added to be exact."""
+        """Compute the second derivatives of V without what is negative: pp, ph, hh, pΔ, hΔ, ΔΔ; and what hh has to be
+        added to be exact."""
         cosine = wp.cos(angle)
         length = crimp_length(p, h)
         pull = crimp_tension(length / rest - scalar(1.0), k, scalar(BUCKLING) * b * cosine * cosine)
@@ -117,8 +121,11 @@ def functions(variant: Variant) -> SimpleNamespace:
         pp = stiff * g_p * g_p + along * n_p * n_p + bent * h * h
         ph = stiff * g_p * g_h + along * n_p * n_h - bent * h * p
         hh = stiff * g_h * g_h + along * n_h * n_h + bent * p * p
-        rest_rest = stiff * r * r + along * length * length / (rest * rest)
-        return pp, ph, hh, rest_rest, wp.min(pull[1], scalar(0.0)) * turned * p * p
+        ratio = length / rest
+        p_rest = -stiff * g_p * r - along * n_p * ratio
+        h_rest = -stiff * g_h * r - along * n_h * ratio
+        rest_rest = stiff * r * r + along * ratio * ratio
+        return pp, ph, hh, p_rest, h_rest, rest_rest, wp.min(pull[1], scalar(0.0)) * turned * p * p
 
     @wp.func
     def straight_slopes(p: scalar, rest: scalar, k: scalar, angle: scalar) -> vec3:
@@ -174,7 +181,7 @@ def functions(variant: Variant) -> SimpleNamespace:
                     yarn = side / 2
                     if side > 1:
                         mine = total - h
-                    _pp, _ph, hh, _rr, less = crimp_curvature(
+                    _pp, _ph, hh, _pr, _hr, _rr, less = crimp_curvature(
                         p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn]
                     )
                     curvature += parts[side] * wp.max(hh + less, scalar(0.1) * hh)
@@ -193,9 +200,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         return vec2(h, by_curvature)
 
     @wp.func_grad(solve_height)
-    def adj_solve_height(
-        total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2, adj_ret: vec2
-    ):
+    def adj_solve_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2, adj_ret: vec2):
         """Reverse it: as if it were a number, for crimp_height has the derivative."""
         wp.adjoint[total] += scalar(0.0)
 
@@ -280,25 +285,23 @@ def define(variant: Variant) -> wp.Kernel:
     yarns_of, segments_of = near.yarns, near.segments
 
     @wp.func
-    def add_matrix(
+    def add_between_positions(
         crimp: Crimp,
         i: int,
         position: wp.array(dtype=vec3),
         blocks: BlockMatrix,
         c: mat44,
         across: vec4,
-        of_rest: vec4,
     ):
-        """Add the blocks of a node's segments: c, second derivatives by their lengths; across, those across each; of
-        their Δs."""
+        """Add the blocks of a node's segments: c, second derivatives by their lengths; across, those across each."""
         all = wp.identity(n=3, dtype=scalar) * scalar(0.0)
         for k in range(4):
             if crimp.crimp_sides[i][k] != 0:
                 at = index(crimp.crimp_around[i][k])
                 direction = k / 2
                 t = wp.normalize(position[at] - position[i])
-                bare = wp.identity(n=3, dtype=scalar) * across[k] - wp.outer(t, t) * across[k]
-                with_node = bare * scalar(1.0)
+                bare = (wp.identity(n=3, dtype=scalar) - wp.outer(t, t)) * across[k]
+                with_node = bare
                 for m in range(4):
                     if c[k, m] != scalar(0.0):
                         other = index(crimp.crimp_around[i][m])
@@ -308,9 +311,7 @@ def define(variant: Variant) -> wp.Kernel:
                             wp.atomic_add(blocks.diagonal_xx, at, block + bare)
                         elif k < m:
                             if k / 2 == m / 2:
-                                wp.atomic_add(
-                                    blocks.upper_xx, index(blocks.stencil * at + 2 + direction), block
-                                )
+                                wp.atomic_add(blocks.upper_xx, index(blocks.stencil * at + 2 + direction), block)
                             else:
                                 slot = index(crimp.crimp_corners[i][2 * k + m - 2])
                                 if m == 2:
@@ -323,14 +324,54 @@ def define(variant: Variant) -> wp.Kernel:
                     wp.atomic_add(blocks.upper_xx, index(blocks.stencil * at + direction), -with_node)
                 else:
                     wp.atomic_add(blocks.upper_xx, index(blocks.stencil * i + direction), -wp.transpose(with_node))
-                if wp.static(sliding):
-                    wp.atomic_add(blocks.diagonal_ss, 2 * at + direction, of_rest[k])
-                    wp.atomic_add(blocks.diagonal_ss, 2 * i + direction, of_rest[k])
-                    if k % 2 == 0:
-                        wp.atomic_add(blocks.upper_ss, 4 * at + direction, -of_rest[k])
-                    else:
-                        wp.atomic_add(blocks.upper_ss, 4 * i + direction, -of_rest[k])
         wp.atomic_add(blocks.diagonal_xx, i, all)
+
+    @wp.func
+    def add_along_yarns(
+        crimp: Crimp,
+        i: int,
+        position: wp.array(dtype=vec3),
+        blocks: BlockMatrix,
+        e: mat44,
+        r: mat44,
+    ):
+        """Add the blocks of (u, v): e, second derivatives by a segment's length and a Δs of the same yarn; r, by
+        two Δs."""
+        for direction in range(2):
+            k = 2 * direction
+            m = k + 1
+            before = i
+            after = i
+            t0 = vec3()
+            t1 = vec3()
+            if crimp.crimp_sides[i][k] != 0:
+                before = index(crimp.crimp_around[i][k])
+                t0 = wp.normalize(position[before] - position[i])
+            if crimp.crimp_sides[i][m] != 0:
+                after = index(crimp.crimp_around[i][m])
+                t1 = wp.normalize(position[after] - position[i])
+            s = 2 * i + direction
+            wp.atomic_add(blocks.diagonal_xs, s, t0 * (e[k, m] - e[k, k]) + t1 * (e[m, m] - e[m, k]))
+            wp.atomic_add(blocks.diagonal_ss, s, r[k, k] - scalar(2.0) * r[k, m] + r[m, m])
+            if before != i:
+                wp.atomic_add(blocks.diagonal_xs, 2 * before + direction, -t0 * e[k, k])
+                wp.atomic_add(blocks.diagonal_ss, 2 * before + direction, r[k, k])
+                slot = 4 * before + direction
+                wp.atomic_add(blocks.upper_xs, slot, t0 * (e[k, k] - e[k, m]))
+                wp.atomic_add(blocks.upper_sx, slot, t0 * e[k, k] + t1 * e[m, k])
+                wp.atomic_add(blocks.upper_ss, slot, r[k, m] - r[k, k])
+            if after != i:
+                wp.atomic_add(blocks.diagonal_xs, 2 * after + direction, t1 * e[m, m])
+                wp.atomic_add(blocks.diagonal_ss, 2 * after + direction, r[m, m])
+                slot = 4 * i + direction
+                wp.atomic_add(blocks.upper_xs, slot, -t0 * e[k, m] - t1 * e[m, m])
+                wp.atomic_add(blocks.upper_sx, slot, t1 * (e[m, k] - e[m, m]))
+                wp.atomic_add(blocks.upper_ss, slot, r[k, m] - r[m, m])
+            if before != i and after != i:
+                slot = 4 * before + 2 + direction
+                wp.atomic_add(blocks.upper_xs, slot, t0 * e[k, m])
+                wp.atomic_add(blocks.upper_sx, slot, -t1 * e[m, k])
+                wp.atomic_add(blocks.upper_ss, slot, -r[k, m])
 
     @variant.kernel("crimp")
     def crimp_interchange_term(
@@ -385,12 +426,12 @@ def define(variant: Variant) -> wp.Kernel:
 
         if matrix != 0:
             factor = blocks.coefficients[0][2]
-            if wp.static(sliding):
-                factor *= scalar(2.0)
             c = mat44()
+            e = mat44()
+            r = mat44()
             across = vec4()
-            of_rest = vec4()
-            coupling = vec4()
+            by_p = vec4()
+            by_rest = vec4()
             curvature = scalar(0.0)
             for side in range(4):
                 code = crimp.crimp_sides[i][side]
@@ -404,26 +445,42 @@ def define(variant: Variant) -> wp.Kernel:
                             mine = total - h
                             sign = scalar(-1.0)
                         slopes = crimp_slopes(p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn])
-                        pp, ph, hh, rr, _less = crimp_curvature(
+                        pp, ph, hh, pr, hr, rr, _less = crimp_curvature(
                             p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn]
                         )
                         c[side, side] = part * pp
-                        coupling[side] = sign * part * ph
+                        e[side, side] = part * pr
+                        r[side, side] = part * rr
+                        by_p[side] = sign * part * ph
+                        by_rest[side] = sign * part * hr
                         curvature += part * hh
-                        of_rest[side] = part * rr
                         across[side] = part * wp.max(slopes[0], scalar(0.0)) / wp.max(p[side], scalar(1.0e-12))
                     else:
                         slopes = straight_slopes(p[side], rest[side], k[yarn], angle[yarn])
                         by_cosine = scalar(1.0) / wp.cos(angle[yarn])
                         ratio = p[side] * by_cosine / rest[side]
-                        c[side, side] = part * k[yarn] / rest[side] * by_cosine * by_cosine
-                        of_rest[side] = part * k[yarn] / rest[side] * ratio * ratio
+                        along = part * k[yarn] / rest[side]
+                        c[side, side] = along * by_cosine * by_cosine
+                        e[side, side] = -along * by_cosine * ratio
+                        r[side, side] = along * ratio * ratio
                         across[side] = part * wp.max(slopes[0], scalar(0.0)) / wp.max(p[side], scalar(1.0e-12))
+            by_yarn = wp.bool(wp.static(sliding)) and blocks.evaluations[0] % 2 == 0
             if curvature > scalar(0.0):
                 for row in range(4):
                     for column in range(4):
-                        c[row, column] = c[row, column] - coupling[row] * coupling[column] / curvature
-            add_matrix(crimp, i, position, blocks, c, across, of_rest)
+                        if row / 2 == column / 2:
+                            c[row, column] = c[row, column] - by_p[row] * by_p[column] / curvature
+                            e[row, column] = e[row, column] - by_p[row] * by_rest[column] / curvature
+                            r[row, column] = r[row, column] - by_rest[row] * by_rest[column] / curvature
+                        elif not by_yarn:
+                            c[row, column] = c[row, column] - by_p[row] * by_p[column] / curvature
+            if wp.static(sliding):
+                if not by_yarn:
+                    e = mat44()
+                    r *= scalar(HELD)
+            add_between_positions(crimp, i, position, blocks, c, across)
+            if wp.static(sliding):
+                add_along_yarns(crimp, i, position, blocks, e, r)
 
     return crimp_interchange_term
 

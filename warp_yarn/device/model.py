@@ -170,7 +170,9 @@ class Model:
             self.launch("contact_normal", "crossings")
             if self.scene.contact_force == "crimped":
                 names = self.scene.terms
-                self.launch("crimped_contact_load", "bends", stretches=int("stretch" in names), bends=int("bending" in names))
+                self.launch(
+                    "crimped_contact_load", "bends", stretches=int("stretch" in names), bends=int("bending" in names)
+                )
         self.contact.find()
 
     def _presses(self, term: Term) -> int:
