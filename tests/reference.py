@@ -342,9 +342,11 @@ class Oracle:
         )
 
     def woven(self, direction: int) -> list[float]:
-        """Distance of crossings, and length of yarn between them, as woven in a regular grid."""
-        x, to = self.cloth.position, (self.node(0, 1), self.node(1, 0))[direction]
-        return [math.dist(x[0].tolist(), x[to].tolist()), self.cloth.spacing]
+        """Distance of crossings, and length of yarn between them, as woven, of a cloth of one sett and crimp each."""
+        spacing, crimp = (
+            value if isinstance(value, tuple) else (value, value) for value in (self.cloth.spacing, self.cloth.crimp)
+        )
+        return [spacing[1 - direction], spacing[1 - direction] * (1.0 + crimp[direction])]
 
     def _build_crimp(self) -> None:
         unknowns, parts, k, b, straight, its = [], [], [], [], [], []

@@ -38,14 +38,13 @@ def structs(variant: Variant) -> SimpleNamespace:
     @wp.struct
     class Crimp:
         """What crimp interchange runs over (``description/crimp.py``): of each node its four segments, what is at
-        their ends and the matrix blocks between those of two yarns, its two yarns; of each yarn θ₀ and L₀."""
+        their ends and the matrix blocks between those of two yarns, its two yarns; of each yarn 1/cos θ₀."""
 
         crimp_sides: wp.array(dtype=wp.vec4i)
         crimp_around: wp.array(dtype=wp.vec4i)
         crimp_corners: wp.array(dtype=wp.vec4i)
-        crimp_yarns: wp.array(dtype=int)
-        set_angle: wp.array(dtype=scalar)
-        set_length: wp.array(dtype=scalar)
+        node_yarns: wp.array(dtype=int)
+        lengthening: wp.array(dtype=scalar)
 
     @wp.struct
     class SolverWork:

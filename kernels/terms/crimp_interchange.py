@@ -23,7 +23,8 @@ yarn stays on one side (floats), keep their crimp: V = ½ kₛ Δs (p/(Δs cos �
 
 The contact force is what it takes to hold h₁ + h₂, and half of n·(F of the warp − F of the weft) as of ``stretch``.
 
-Parameters: ``stretch`` Y [Pa]; ``bend`` B [Pa m²]; ``radius`` R [m], for d₁ + d₂ too; θ₀ and L₀ of each yarn as woven.
+Parameters: ``stretch`` Y [Pa]; ``bend`` B [Pa m²]; ``radius``, half the thickness of each yarn for d₁ + d₂ [m];
+``lengthening`` of each yarn as woven, 1/cos θ₀, and times its ``spacing`` L₀ [m].
 
 h comes of Newton's iteration between bounds, and of one more step whose derivative is that of the implicit function
 theorem, so that reverse mode differentiates through it.
@@ -40,6 +41,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import index
 from ..core.structs import structs
 from ..core.variant import Term, Variant
@@ -140,20 +142,20 @@ def functions(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def height_slope(
-        h: scalar, total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2
+        h: scalar, total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec4, angle: vec2
     ) -> scalar:
         """Compute ∂W/∂h at a height."""
         result = scalar(0.0)
         for side in range(4):
             if parts[side] > scalar(0.0):
                 if side < 2:
-                    result += parts[side] * crimp_slopes(p[side], h, rest[side], k[0], b[0], angle[0])[1]
+                    result += parts[side] * crimp_slopes(p[side], h, rest[side], k[0], b[side], angle[0])[1]
                 else:
-                    result -= parts[side] * crimp_slopes(p[side], total - h, rest[side], k[1], b[1], angle[1])[1]
+                    result -= parts[side] * crimp_slopes(p[side], total - h, rest[side], k[1], b[side], angle[1])[1]
         return result
 
     @wp.func
-    def solve_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2) -> vec2:
+    def solve_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec4, angle: vec2) -> vec2:
         """Find the h that makes W least, and 1/W'' there; (½ total, 0) where no segment depends on it.
 
         Beyond what a yarn was set to, and beyond h₁ + h₂ of the other, W rises outwards: these are the bounds.
@@ -182,7 +184,7 @@ def functions(variant: Variant) -> SimpleNamespace:
                     if side > 1:
                         mine = total - h
                     _pp, _ph, hh, _pr, _hr, _rr, less = crimp_curvature(
-                        p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn]
+                        p[side], mine, rest[side], k[yarn], b[side], angle[yarn]
                     )
                     curvature += parts[side] * wp.max(hh + less, scalar(0.1) * hh)
             by_curvature = scalar(1.0) / curvature
@@ -200,12 +202,12 @@ def functions(variant: Variant) -> SimpleNamespace:
         return vec2(h, by_curvature)
 
     @wp.func_grad(solve_height)
-    def adj_solve_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2, adj_ret: vec2):
+    def adj_solve_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec4, angle: vec2, adj_ret: vec2):
         """Reverse it: as if it were a number, for crimp_height has the derivative."""
         wp.adjoint[total] += scalar(0.0)
 
     @wp.func
-    def crimp_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec2, angle: vec2) -> scalar:
+    def crimp_height(total: scalar, p: vec4, rest: vec4, parts: vec4, k: vec2, b: vec4, angle: vec2) -> scalar:
         """Find h. With the W'' of the solve held, the derivative of this one step is −(∂²W/∂h∂y)/W'' in all y."""
         solved = solve_height(total, p, rest, parts, k, b, angle)
         return solved[0] - solved[1] * height_slope(solved[0], total, p, rest, parts, k, b, angle)
@@ -224,18 +226,8 @@ def around(variant: Variant) -> SimpleNamespace:
     """Make the functions that look at a node and its four segments."""
     scalar, vec3 = variant.scalar, variant.vec3
     vec2, vec4 = wp.types.vector(2, scalar), variant.vec4
-    Crimp = structs(variant).Crimp
+    Crimp, own = structs(variant).Crimp, general.functions(variant).own
     stretch_stiffness, bend_stiffness = stretch.functions(variant).stiffness, bending.functions(variant).stiffness
-
-    @wp.func
-    def diameters(radius: wp.array(dtype=scalar), warp: int, weft: int) -> scalar:
-        """Compute d₁ + d₂ of two yarns."""
-        return scalar(4.0) * radius[0]
-
-    @wp.func
-    def beam_stiffness(k_b: scalar, length: scalar) -> scalar:
-        """Compute 12 k_b/L₀² [N]."""
-        return scalar(12.0) * k_b / (length * length)
 
     @wp.func
     def yarns_of(
@@ -245,33 +237,51 @@ def around(variant: Variant) -> SimpleNamespace:
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
     ):
-        """Compute kₛ, 12 k_b/L₀² and θ₀ of the warp and the weft yarn of a node, and d₁ + d₂."""
-        warp = index(crimp.crimp_yarns[2 * i])
-        weft = index(crimp.crimp_yarns[2 * i + 1])
-        k = vec2(stretch_stiffness(stretch[warp], radius[0]), stretch_stiffness(stretch[weft], radius[0]))
-        b = vec2(
-            beam_stiffness(bend_stiffness(bend[warp], radius[0]), crimp.set_length[warp]),
-            beam_stiffness(bend_stiffness(bend[weft], radius[0]), crimp.set_length[weft]),
-        )
-        return k, b, vec2(crimp.set_angle[warp], crimp.set_angle[weft]), diameters(radius, warp, weft)
+        """Compute kₛ, k_b and θ₀ of the warp and the weft yarn of a node, and d₁ + d₂ of their thicknesses."""
+        k = vec2()
+        k_b = vec2()
+        angle = vec2()
+        total = scalar(0.0)
+        for direction in range(2):
+            # on the border of an outline there may be one yarn alone
+            yarn = wp.max(crimp.node_yarns[2 * i + direction], 0)
+            half_width = radius[own(2 * yarn)]
+            half_thickness = radius[own(2 * yarn + 1)]
+            k[direction] = stretch_stiffness(stretch[yarn], half_width, half_thickness)
+            k_b[direction] = bend_stiffness(bend[yarn], half_width, half_thickness)
+            angle[direction] = wp.acos(scalar(1.0) / crimp.lengthening[yarn])
+            total += scalar(2.0) * half_thickness
+        return k, k_b, angle, total
 
     @wp.func
-    def segments_of(crimp: Crimp, i: int, position: wp.array(dtype=vec3), euler: wp.array(dtype=scalar)):
-        """Compute p and Δs of the segments left, right, up and down of a node, and the part of each that is its own
+    def segments_of(
+        crimp: Crimp,
+        i: int,
+        k_b: vec2,
+        spacing: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+    ):
+        """Compute p, Δs and b of the segments left, right, up and down of a node, and the part of each that is its own
         and crimped, 0 of others."""
         p = vec4()
         rest = vec4()
+        b = vec4()
         parts = vec4()
         for side in range(4):
             p[side] = scalar(1.0)
             rest[side] = scalar(1.0)
+            b[side] = scalar(1.0)
             if crimp.crimp_sides[i][side] != 0:
                 at = index(crimp.crimp_around[i][side])
                 s = side / 2
+                yarn = wp.max(crimp.node_yarns[2 * i + s], 0)
                 p[side] = wp.length(position[at] - position[i])
                 rest[side] = wp.abs(euler[2 * at + s] - euler[2 * i + s])
+                woven = crimp.lengthening[yarn] * spacing[own(2 * wp.min(at, i) + s)]
+                b[side] = scalar(12.0) * k_b[s] / (woven * woven)
                 parts[side] = wp.max(scalar(0.5) * scalar(crimp.crimp_sides[i][side]), scalar(0.0))
-        return p, rest, parts
+        return p, rest, b, parts
 
     return SimpleNamespace(yarns=yarns_of, segments=segments_of)
 
@@ -381,6 +391,7 @@ def define(variant: Variant) -> wp.Kernel:
         stretch: wp.array(dtype=scalar),
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
         # state in
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -395,8 +406,8 @@ def define(variant: Variant) -> wp.Kernel:
         blocks: BlockMatrix,
     ):
         i = index(wp.tid())
-        k, b, angle, total = yarns_of(crimp, i, stretch, bend, radius)
-        p, rest, parts = segments_of(crimp, i, position, euler)
+        k, k_b, angle, total = yarns_of(crimp, i, stretch, bend, radius)
+        p, rest, b, parts = segments_of(crimp, i, k_b, spacing, position, euler)
         h = crimp_height(total, p, rest, parts, k, b, angle)
         for side in range(4):
             code = crimp.crimp_sides[i][side]
@@ -409,7 +420,7 @@ def define(variant: Variant) -> wp.Kernel:
                 part = scalar(0.5) * wp.abs(scalar(code))
                 slopes = straight_slopes(p[side], rest[side], k[direction], angle[direction])
                 if code > 0:
-                    slopes = crimp_slopes(p[side], mine, rest[side], k[direction], b[direction], angle[direction])
+                    slopes = crimp_slopes(p[side], mine, rest[side], k[direction], b[side], angle[direction])
                 f = wp.normalize(position[at] - position[i]) * (part * slopes[0])
                 wp.atomic_add(force, i, f)
                 wp.atomic_add(force, at, -f)
@@ -444,9 +455,9 @@ def define(variant: Variant) -> wp.Kernel:
                         if side > 1:
                             mine = total - h
                             sign = scalar(-1.0)
-                        slopes = crimp_slopes(p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn])
+                        slopes = crimp_slopes(p[side], mine, rest[side], k[yarn], b[side], angle[yarn])
                         pp, ph, hh, pr, hr, rr, _less = crimp_curvature(
-                            p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn]
+                            p[side], mine, rest[side], k[yarn], b[side], angle[yarn]
                         )
                         c[side, side] = part * pp
                         e[side, side] = part * pr
@@ -498,13 +509,14 @@ def define_energy(variant: Variant) -> wp.Kernel:
         stretch: wp.array(dtype=scalar),
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
         i = index(wp.tid())
-        k, b, angle, total = yarns_of(crimp, i, stretch, bend, radius)
-        p, rest, parts = segments_of(crimp, i, position, euler)
+        k, k_b, angle, total = yarns_of(crimp, i, stretch, bend, radius)
+        p, rest, b, parts = segments_of(crimp, i, k_b, spacing, position, euler)
         h = crimp_height(total, p, rest, parts, k, b, angle)
         for side in range(4):
             code = crimp.crimp_sides[i][side]
@@ -513,7 +525,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
                 mine = h
                 if side > 1:
                     mine = total - h
-                v = crimp_energy(p[side], mine, rest[side], k[yarn], b[yarn], angle[yarn])
+                v = crimp_energy(p[side], mine, rest[side], k[yarn], b[side], angle[yarn])
                 if code < 0:
                     strain = p[side] / (rest[side] * wp.cos(angle[yarn])) - scalar(1.0)
                     v = scalar(0.5) * k[yarn] * rest[side] * strain * strain

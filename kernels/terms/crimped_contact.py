@@ -11,6 +11,7 @@ It takes the place of what stretch and bending add to ``contact_load``.
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import index
 from ..core.variant import Variant
 from . import bending, stretch
@@ -19,12 +20,14 @@ from . import bending, stretch
 def define(variant: Variant) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     stretch_stiffness = stretch.functions(variant).stiffness
+    own = general.functions(variant).own
     bend_stiffness, bend_forces = bending.functions(variant).stiffness, bending.functions(variant).forces
 
     @wp.func
-    def tension_along(d: vec3, crimped: vec3, rest: scalar, stiffness: scalar) -> vec3:
+    def tension_along(d: vec3, crimped: vec3, rest: scalar, stiffness: scalar, lengthening: scalar) -> vec3:
         """Compute the force of a segment d on the node that it starts at, along the crimped one."""
-        return wp.normalize(crimped) * (stiffness * (wp.length(d) / rest - scalar(1.0)))
+        strain = wp.length(d) * lengthening / rest - scalar(1.0)
+        return wp.normalize(crimped) * (stiffness * strain * lengthening)
 
     @variant.kernel("crimp")
     def crimped_contact_load(
@@ -37,6 +40,7 @@ def define(variant: Variant) -> wp.Kernel:
         bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
+        lengthening: wp.array(dtype=scalar),
         contact_offset: wp.array(dtype=scalar),
         stretches: int,
         bends: int,
@@ -63,13 +67,18 @@ def define(variant: Variant) -> wp.Kernel:
         crimped2 = e2 + (normal[a] - normal[c]) * offset
         before = euler[2 * c + direction] - euler[2 * a + direction]
         after = euler[2 * b + direction] - euler[2 * c + direction]
+        half_width = radius[own(2 * yarn)]
+        half_thickness = radius[own(2 * yarn + 1)]
         if stretches != 0:
-            k = stretch_stiffness(stretch[yarn], radius[0]) * half
-            pressing = tension_along(e1, crimped1, after, k) + tension_along(e2, crimped2, before, k)
+            k = stretch_stiffness(stretch[yarn], half_width, half_thickness) * half
+            pressing = tension_along(e1, crimped1, after, k, lengthening[yarn])
+            pressing += tension_along(e2, crimped2, before, k, lengthening[yarn])
             wp.atomic_add(contact_load, c, wp.dot(normal[c], pressing))
         if bends != 0:
-            k_b = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / (before + after) * half
-            pressing_b, pressing_a = bend_forces(crimped1, crimped2, k_b, spacing[0])
+            k_b = scalar(2.0) * bend_stiffness(bend[yarn], half_width, half_thickness) / (before + after) * half
+            unit1 = spacing[own(2 * c + direction)]
+            unit2 = spacing[own(2 * a + direction)]
+            pressing_b, pressing_a = bend_forces(crimped1, crimped2, k_b, unit1, unit2)
             wp.atomic_add(contact_load, a, wp.dot(normal[a], pressing_a))
             wp.atomic_add(contact_load, b, wp.dot(normal[b], pressing_b))
             wp.atomic_add(contact_load, c, -wp.dot(normal[c], pressing_a + pressing_b))

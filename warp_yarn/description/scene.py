@@ -11,9 +11,10 @@ import numpy as np
 
 from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
-from .cloth import Cloth, Fixed
+from .cloth import Cloth
 from .cloths import Cloths, as_one
 from .crimp import lacks_bending, lacks_crimp
+from .fixed import Fixed
 from .obstacles import Contact, Obstacle
 
 CONTACT_FORCES = ("published", "crimped")

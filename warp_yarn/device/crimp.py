@@ -20,7 +20,5 @@ def set_arrays(arrays: Arrays) -> None:
         for name, values in crimp.interchange(cloth).items():
             dtype = arrays.declared[name].dtype(arrays.variant)
             arrays[name] = wp.array(np.ascontiguousarray(values), dtype=dtype, device=arrays.device)
-        arrays["set_length"] = arrays.numbers(crimp.woven(cloth)[1])
-        arrays["set_angle"] = arrays.numbers(np.arccos(1.0 / (1.0 + crimp.yarn_crimp(cloth))))
     if "crimped contact" in arrays.conditions:
         arrays["contact_offset"] = arrays.numbers(0.5 * crimp.heights(cloth))
