@@ -480,11 +480,11 @@ def define(variant: Variant) -> wp.Kernel:
                 for row in range(4):
                     for column in range(4):
                         if row / 2 == column / 2:
-                            c[row, column] = c[row, column] - by_p[row] * by_p[column] / curvature
-                            e[row, column] = e[row, column] - by_p[row] * by_rest[column] / curvature
-                            r[row, column] = r[row, column] - by_rest[row] * by_rest[column] / curvature
+                            c[row, column] -= by_p[row] * by_p[column] / curvature
+                            e[row, column] -= by_p[row] * by_rest[column] / curvature
+                            r[row, column] -= by_rest[row] * by_rest[column] / curvature
                         elif not by_yarn:
-                            c[row, column] = c[row, column] - by_p[row] * by_p[column] / curvature
+                            c[row, column] -= by_p[row] * by_p[column] / curvature
             if wp.static(sliding):
                 if not by_yarn:
                     e = mat44()

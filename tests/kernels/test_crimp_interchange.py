@@ -1,0 +1,373 @@
+"""Yarns that straighten at each other's expense."""
+
+import dataclasses
+import functools
+import itertools
+import math
+import zlib
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from cases import YARNS, Case
+from checks import InternalChecks, error, matrix
+from reference import Oracle, Tensor, clamped, crimped_crossing, crimped_segment, tensor
+from scipy.optimize import brentq
+from torch.func import grad, hessian, jacrev, vmap
+from warp_yarn.description.crimp import crimp_height, interchange
+from warp_yarn.kernels import Variant
+
+import warp_yarn as wy
+
+CRIMP = (0.05, 0.09)
+ROUNDING = 1e-13
+"""As of all terms; of h, which is found to 1e-13 and then once more."""
+
+
+@functools.cache
+def cloth(name: str) -> wy.Cloth:
+    """A weave whose diameters are 7 % more than goes with its crimps, so that it is not at rest as woven."""
+    rows, columns = {"plain": (5, 5), "twill": (6, 6), "satin": (4, 7)}[name]
+    spacing = 1e-3
+    diameter = 0.5 * sum(crimp_height(spacing, spacing * (1.0 + c)) for c in CRIMP)
+    yarns = [YARNS[:2], YARNS[1:], YARNS[::2]][len(name) % 3]
+    return wy.Cloth(
+        wy.WEAVES[name](rows=rows, columns=columns),
+        yarns=yarns,
+        spacing=spacing,
+        radius=0.5 * 1.07 * diameter,
+        crimp=CRIMP,
+        pose="flat",
+        friction_damping=0.1,
+    )
+
+
+@functools.cache
+def scene(name: str, terms: tuple[str, ...] | None, sliding: bool) -> wy.Scene:
+    c = cloth(name)
+    return wy.Scene(c, pins=c.corners("top"), terms=terms, sliding=sliding, crimp_interchange=True)
+
+
+@functools.cache
+def simulator(name: str, terms: tuple[str, ...] | None, sliding: bool) -> wy.Simulator:
+    return wy.Simulator(scene(name, terms, sliding), integrator="linear")
+
+
+@functools.cache
+def oracle(name: str, terms: tuple[str, ...] | None, sliding: bool) -> Oracle:
+    return Oracle(scene(name, terms, sliding))
+
+
+SIZES = {"woven": (1.0, 0.0), "taut": (1.25, 0.03), "knee": (1.06, 0.04), "pushed": (0.85, 0.04), "rough": (1.0, 0.3)}
+"""Of states: how much larger the cloth is, and how far nodes are from there in spacings."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CrimpCase(Case):
+    """A crimped cloth in a state."""
+
+    @property
+    def cloth(self) -> wy.Cloth:
+        return cloth(self.cloth_name)
+
+    def simulator(self, *terms: str) -> wy.Simulator:
+        return simulator(self.cloth_name, terms or None, self.sliding)
+
+    def oracle(self, *terms: str) -> Oracle:
+        return oracle(self.cloth_name, terms or None, self.sliding)
+
+    @functools.cached_property
+    def state(self) -> wy.State:
+        c, (size, jitter) = self.cloth, SIZES[self.state_name]
+        rng = np.random.default_rng(zlib.crc32(str(self).encode()))
+        x = size * c.position + rng.uniform(-jitter, jitter, (c.nodes, 3)) * c.spacing
+        inside = (c.topology.is_crossing != 0)[:, None] * self.sliding
+        euler = c.euler + rng.uniform(-jitter, jitter, (c.nodes, 2)) * 0.3 * c.spacing * inside
+        velocity = rng.normal(0.0, 0.5, (c.nodes, 3))
+        return wy.State(x, euler, velocity, rng.normal(0.0, 0.2, (c.nodes, 2)) * inside, euler.copy())
+
+
+def cases(states: tuple[str, ...] = tuple(SIZES)) -> tuple[CrimpCase, ...]:
+    return tuple(CrimpCase(*case) for case in itertools.product(("plain", "twill", "satin"), states, (True, False)))
+
+
+def lengths(q: Tensor) -> tuple[Tensor, Tensor]:
+    """p and Δs of a crossing's four segments."""
+    x, u, v = q[:15].reshape(5, 3), q[15:20], q[20:25]
+    p = torch.linalg.vector_norm(x[1:] - x[0], dim=1)
+    return p, torch.stack([u[0] - u[1], u[2] - u[0], v[0] - v[3], v[4] - v[0]])
+
+
+def height(q: Tensor, parts: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor) -> Tensor:
+    """h by bisection, of the energy alone."""
+    p, rest = lengths(q)
+
+    def slope(h: Tensor) -> Tensor:
+        return grad(lambda h: side_energies(h, p, rest, k, b, woven, total) @ parts)(h)
+
+    low, high = -3.0 * total, 4.0 * total
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if slope(middle) > 0.0 else (middle, high)
+    return 0.5 * (low + high)
+
+
+def side_energies(h: Tensor, p: Tensor, rest: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor) -> Tensor:
+    heights = torch.stack([h, h, total - h, total - h])
+    repeated = (each.repeat_interleave(2, 0) for each in (k, b, woven))
+    return vmap(crimped_segment)(p, heights, rest, *repeated)
+
+
+def compression(p: Tensor, h: Tensor, rest: Tensor, k: Tensor, b: Tensor, woven: Tensor) -> Tensor:
+    """What a pushed yarn takes away from the second derivative in (p, h)."""
+
+    def length(y: Tensor) -> Tensor:
+        return torch.sqrt(y[0] ** 2 + 9.0 / 8.0 * y[1] ** 2)
+
+    def of_length(along: Tensor) -> Tensor:
+        return crimped_segment(along, tensor(0.0), rest, k, tensor(1e-30), woven)
+
+    y = torch.stack([p, h])
+    strain = length(y) / rest - 1.0
+    limit = 3.0 * b / woven[1] ** 2 * (woven[0] / woven[1]) ** 2
+    tension = torch.where(strain < 0.0, k * strain / (1.0 - k * strain / limit), 0.0)
+    return tension * hessian(length)(y)
+
+
+def expected_block(q: Tensor, *parameters: Tensor, sliding: bool) -> Tensor:
+    """The second derivative of W without what compression takes away, put together from that of every segment; with
+    sliding, of the coupling through h that within each yarn alone."""
+    parts, k, b, woven, total = parameters
+    h = height(q, *parameters)
+    p, rest = lengths(q)
+
+    def of_all(y: Tensor) -> Tensor:
+        return parts @ side_energies(y[8], y[:4], y[4:8], k, b, woven, total)
+
+    y = torch.cat([p, rest, h[None]])
+    second, slopes = hessian(of_all)(y), grad(of_all)(y)
+    for side in range(4):
+        sign, mine = (1.0, h) if side < 2 else (-1.0, total - h)
+        yarn = side // 2
+        less = parts[side] * compression(p[side], mine, rest[side], k[yarn], b[yarn], woven[yarn])
+        signs = tensor([1.0, sign])
+        which = torch.tensor([side, 8])
+        second[which[:, None], which[None, :]] -= less * torch.outer(signs, signs)
+    coupling = second[:8, 8]
+    yarns = torch.arange(8) // 2 % 2
+    same = (yarns[:, None] == yarns[None, :]).double() if sliding else torch.ones(8, 8)
+    reduced = second[:8, :8].clone()
+    if second[8, 8] > 0.0:
+        reduced -= same * torch.outer(coupling, coupling) / second[8, 8]
+    jacobian = jacrev(lambda q: torch.cat(lengths(q)))(q)
+    result = jacobian.mT @ reduced @ jacobian
+    bent = hessian(lambda q: lengths(q)[0] @ slopes[:4].clamp(min=0.0))(q)
+    return result + bent
+
+
+class TestCrimpInterchange(InternalChecks):
+    term = "crimp_interchange"
+    cases = cases()
+    step = 2e-9
+    """Where a yarn gives way to being pushed is 1e-3 of its length away: (2e-6/1e-3)⁴."""
+    tolerance = ROUNDING
+    tolerance_of_differences = 2e-8
+    """And 1e-16/2e-6 for rounding, of a force that is some 1e-2 of the natural one, and of pushed yarns' curvature."""
+
+    def expected_matrix(self, case: Case) -> Tensor:
+        """What the kernel's docstring says, at a first evaluation."""
+        o, size = self.oracle(case), len(case.q)
+        q, parameters = case.q[o.interchange.unknowns], o.interchange.parameters
+        blocks = [expected_block(*each, sliding=case.sliding) for each in zip(q, *parameters, strict=True)]
+        straight = clamped(o.straight.hessians(case.q))
+        return o.interchange.matrix(torch.stack(blocks), size) + o.straight.matrix(straight, size)
+
+
+@pytest.mark.parametrize("case", cases(("taut",)), ids=str)
+def test_matrix_in_tension_is_exact_or_more_than_half(case: CrimpCase) -> None:
+    """The exact second derivative where yarns do not slide; with sliding, of a first evaluation never less than half."""
+    o = case.oracle("crimp_interchange")
+    size, n = len(case.q), case.unknowns
+    exact = o.interchange.matrix(o.interchange.hessians(case.q), size)
+    exact = (exact + o.straight.matrix(o.straight.hessians(case.q), size))[:n, :n].numpy()
+    found = matrix(case.simulator("crimp_interchange"), case.state, stiffness=1.0)
+    if not case.sliding:
+        assert error(found, exact) < 1e-12
+    assert np.linalg.eigvalsh(2.0 * found - exact).min() > -1e-12 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("case", cases(("taut", "rough")), ids=str)
+def test_matrix_of_the_positions_is_definite_and_exact(case: CrimpCase) -> None:
+    """That of every second evaluation: positions as if Δs were held."""
+    sim = case.simulator("crimp_interchange")
+    system = sim.system(case.state)
+    a = sim.arrays
+    a.zero("evaluations", "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss")
+    held = matrix(simulator(case.cloth_name, ("crimp_interchange",), False), case.state, stiffness=1.0)
+    assert np.isfinite(system.rhs).all()
+    if not case.sliding:
+        return
+    # a locked scene's state has the same (u, v) here
+    n = 3 * case.cloth.nodes
+    assert held.shape == (n, n)
+    assert np.linalg.eigvalsh(held).min() > -1e-12 * np.abs(held).max()
+
+
+@pytest.mark.parametrize("case", cases(("woven", "taut", "knee")), ids=str)
+def test_contact_force_is_what_holds_the_diameters(case: CrimpCase) -> None:
+    """F_n = 2 ∂W/∂(d₁ + d₂), the offset of a yarn being half its height, in a cloth that is flat."""
+    state = dataclasses.replace(case.state, position=case.state.position * [1.0, 1.0, 0.0])
+    o = case.oracle("crimp_interchange", "shear")
+    q = case.q.clone()
+    q[2 : 3 * case.cloth.nodes : 3] = 0.0
+    expected = 2.0 * vmap(grad(crimped_crossing, argnums=5))(q[o.interchange.unknowns], *o.interchange.parameters)
+    found = case.simulator("crimp_interchange", "shear").contact(state)[1][case.cloth.topology.crossing_node]
+    assert error(found, expected.clamp(min=0.0), 1e-3) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["plain", "twill", "satin"])
+def test_every_segment_is_shared_out_once(name: str) -> None:
+    """Its two halves among the nodes at its ends; and straight where no yarn changes sides."""
+    c = cloth(name)
+    sides = interchange(c)["crimp_sides"]
+    a, b = c.topology.segment_nodes.T
+    along = c.topology.yarn_direction[c.topology.segment_yarn]
+    mine, its = sides[a, 2 * along + 1], sides[b, 2 * along]
+    assert (np.abs(mine) + np.abs(its) == 2).all()
+    assert np.abs(sides).sum() == 2 * len(a)
+    crossing = c.topology.is_crossing != 0
+    both = crossing[a] & crossing[b]
+    assert ((mine[both] > 0) == (c.topology.flipped[a] != c.topology.flipped[b])[both]).all()
+
+
+# -- cells of uniform cloth ------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def cell(distance: float, length: float, stretch: float, bend: float = 1e-9, size: int = 5) -> wy.Simulator:
+    """A square plain weave of one yarn, kₛ = stretch [N], k_b = bend [N m²], at rest as woven."""
+    radius = 0.5 * crimp_height(distance, length)
+    area = math.pi * radius**2
+    yarn = wy.Yarn(density=2e-5, stretch=stretch / area, bend=bend / area)
+    c = wy.Cloth(
+        wy.Weave.plain(rows=size, columns=size),
+        yarns=[yarn],
+        spacing=distance,
+        crimp=length / distance - 1.0,
+        radius=radius,
+        pose="flat",
+    )
+    return wy.Simulator(wy.Scene(c, sliding=False, gravity=None, crimp_interchange=True))
+
+
+def pulls(sim: wy.Simulator, along: float, across: float) -> tuple[float, float]:
+    """What the yarns pull with at the border, of a cloth that is so much longer in each direction."""
+    c = sim.scene.cloth
+    state = dataclasses.replace(sim.state, position=c.position * [along, across, 1.0])
+    force = sim.forces(state)["crimp_interchange"][0]
+    return float(force[c.node(2, 0), 0]), float(force[c.node(0, 2), 1])
+
+
+def pulled(sim: wy.Simulator, strain: float) -> tuple[float, float]:
+    """Force of a warp yarn, and strain across, of a cloth that may draw in."""
+    across = brentq(lambda across: pulls(sim, 1.0 + strain, across)[1], 0.5, 1.3, xtol=1e-14)
+    return pulls(sim, 1.0 + strain, across)[0], across - 1.0
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(23.70, 1026.0), (math.degrees(math.acos(1 / 1.05)), 1784.6)])
+def test_moduli_of_leaf_and_kandil(degrees: float, expected: float) -> None:
+    """E = 12 k_b p₂/(p₁ l³ sin²θ) · 2 and ν = 1 of a square cell, l = 0.525 mm and k_b = 1e-9 N m²: at θ = 23.7°, and
+    at 5 % of crimp. Within what 200 N of stretch gives, that they know none of."""
+    length, strain = 0.525e-3, 1e-4
+    sim = cell(length * math.cos(math.radians(degrees)), length, 200.0)
+    ends = [pulled(sim, sign * strain) for sign in (1.0, -1.0)]
+    modulus = (ends[0][0] - ends[1][0]) / (2.0 * strain) / sim.scene.cloth.spacing
+    assert abs(24e-9 / (length**3 * math.sin(math.radians(degrees)) ** 2) / expected - 1.0) < 1e-3
+    assert abs(modulus / expected - 1.0) < 0.01
+    assert abs(-(ends[0][1] - ends[1][1]) / (2.0 * strain) - 1.0) < 0.01
+
+
+@pytest.mark.parametrize("crimp", [0.01, 0.05, 0.1])
+def test_heights_of_peirce(crimp: float) -> None:
+    """h = (4/3) p √c, and h₁ + h₂ = d₁ + d₂ of a cloth at rest, whose yarns neither pull nor press."""
+    distance = 0.5e-3
+    found = crimp_height(distance, distance * (1.0 + crimp))
+    assert abs(found / (4.0 / 3.0 * distance * math.sqrt(crimp)) - 1.0) < 0.03
+    sim = cell(distance, distance * (1.0 + crimp), 200.0)
+    assert abs(2.0 * found / (4.0 * sim.scene.cloth.radius) - 1.0) < 1e-12
+    force, _ = sim.forces()["crimp_interchange"]
+    assert np.abs(force).max() < 1e-11 * 200.0
+    assert sim.contact()[1].max() < 1e-11 * 200.0
+
+
+def test_unequal_crimps_have_the_ratio_of_leaf_and_kandil() -> None:
+    """ν₁₂ = p₂ tan θ₂/(p₁ tan θ₁) of yarns as long as 1.04 and 1.1 times what they cover, and the reverse."""
+    distance, crimps = 0.5e-3, (0.04, 0.1)
+    radius = 0.25 * sum(crimp_height(distance, distance * (1.0 + c)) for c in crimps)
+    area, found = math.pi * radius**2, []
+    for crimp in (crimps, crimps[::-1]):
+        c = wy.Cloth(
+            wy.Weave.plain(rows=5, columns=5),
+            yarns=[wy.Yarn(density=2e-5, stretch=500.0 / area, bend=1e-9 / area)],
+            spacing=distance,
+            crimp=crimp,
+            radius=radius,
+            pose="flat",
+        )
+        sim = wy.Simulator(wy.Scene(c, sliding=False, gravity=None, crimp_interchange=True))
+        found.append(-(pulled(sim, 1e-4)[1] - pulled(sim, -1e-4)[1]) / 2e-4)
+    tangents = [math.tan(math.acos(1.0 / (1.0 + c))) for c in crimps]
+    assert abs(found[0] / (tangents[1] / tangents[0]) - 1.0) < 0.02
+    assert abs(found[0] * found[1] - 1.0) < 0.02
+
+
+def test_soft_until_straight_and_then_stiff() -> None:
+    """The knee is at the crimp: far before, the slope is Leaf and Kandil's; beyond, the yarn's own."""
+    crimp, stretch = 0.05, 50.0
+    sim = cell(0.5e-3, 0.525e-3, stretch)
+
+    def slope(strain: float) -> float:
+        return (pulled(sim, strain + 1e-4)[0] - pulled(sim, strain - 1e-4)[0]) / 2e-4
+
+    own = stretch / (1.0 + crimp)
+    assert slope(0.0) < 0.03 * own
+    # the weft still resists being bent further
+    assert 0.9 * own < slope(0.1) < 1.1 * own
+    strains = np.linspace(0.0, 0.1, 21)
+    forces = [pulled(sim, strain)[0] for strain in strains]
+    # where the line of the stiff yarn meets no force
+    start = strains[-1] - forces[-1] / slope(0.1)
+    assert abs(start - crimp) < 0.2 * crimp
+    assert np.all(np.diff(forces) > 0.0)
+
+
+def test_there_is_nothing_of_it_in_other_scenes() -> None:
+    c = cloth("plain")
+    sim = wy.Simulator(wy.Scene(c))
+    assert "crimp_interchange" not in sim.scene.terms
+    assert "stretch" in sim.scene.terms
+    assert "stretch" not in scene("plain", None, True).terms
+    assert not {"crimp_sides", "crimp_around", "crimp_corners", "contact_offset"} & set(sim.arrays)
+
+
+def test_single_precision() -> None:
+    case = CrimpCase("twill", "knee", True)
+    sim = wy.Simulator(case.simulator("crimp_interchange").scene, precision="single")
+    expected = case.simulator("crimp_interchange").forces(case.state)["crimp_interchange"]
+    found = sim.forces(case.state)["crimp_interchange"]
+    for mine, its in zip(found, expected, strict=True):
+        # strains are small differences of lengths of 1e-7
+        assert error(mine, its) < 1e-4
+
+
+def test_modules_of_their_own() -> None:
+    """Who has no such scene compiles none of it."""
+    kernels = wy.kernels.build(Variant(wp.float64, True)) if hasattr(wy, "kernels") else None
+    if kernels is None:
+        from warp_yarn.kernels import build
+
+        kernels = build(Variant(wp.float64, True))
+    for name in ("crimp_interchange", "crimp_interchange_energy", "crimped_contact_load"):
+        assert "crimp" in kernels[name].module.name
+    assert "crimp" not in kernels["stretch"].module.name
