@@ -13,7 +13,7 @@ the cloth, Δs that of its yarn, which is a thread of length ℓ that rises by h
 β makes h = (4/3) p √c of a crimp c = ℓ/p − 1, as Peirce has it for yarns that are round at their bends (straight pieces
 would have √2). T is the tension: a yarn that is pushed gives way beyond T_b, which it resists by bending. The second
 part is what it takes to bend a yarn, held at both ends, by r across itself; it is set at the slope θ₀ and the length L₀
-that it was woven with. In place of ``stretch`` a crossing has half of V of each of its four segments, at its own height:
+that it was woven with. In place of ``stretch`` a crossing has half of V of each of its four segments, at its height:
 
     W = min over h of ½ Σ V(p, h₁ or h₂, Δs)
 

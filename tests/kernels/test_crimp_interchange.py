@@ -12,13 +12,13 @@ import torch
 import warp as wp
 from cases import YARNS, Case
 from checks import InternalChecks, check_definite, error, matrix
-from reference import Oracle, Tensor, clamped, crimped_crossing, crimped_segment, tensor
+from reference import Oracle, Tensor, clamped, crimped_crossing, crimped_segment, segments_of, tensor
 from scipy.optimize import brentq
 from torch.func import grad, hessian, jacrev, vmap
-from warp_yarn.description.crimp import crimp_height, interchange
 from warp_yarn.kernels import Variant, build
 
 import warp_yarn as wy
+from warp_yarn.description.crimp import crimp_height, interchange
 from warp_yarn.simulation.linear_system import read_system
 
 CRIMP = (0.05, 0.09)
@@ -95,16 +95,9 @@ def cases(states: tuple[str, ...] = tuple(SIZES)) -> tuple[CrimpCase, ...]:
     return tuple(CrimpCase(*case) for case in every if case[0] == "plain" or case[1] in ("taut", "rough"))
 
 
-def lengths(q: Tensor) -> tuple[Tensor, Tensor]:
-    """p and Δs of a crossing's four segments."""
-    x, u, v = q[:15].reshape(5, 3), q[15:20], q[20:25]
-    p = torch.linalg.vector_norm(x[1:] - x[0], dim=1)
-    return p, torch.stack([u[0] - u[1], u[2] - u[0], v[0] - v[3], v[4] - v[0]])
-
-
 def height(q: Tensor, parts: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor) -> Tensor:
     """h by bisection, of the energy alone."""
-    p, rest = lengths(q)
+    p, rest = segments_of(q)
 
     def slope(h: Tensor) -> Tensor:
         return grad(lambda h: side_energies(h, p, rest, k, b, woven, total) @ parts)(h)
@@ -119,8 +112,7 @@ def height(q: Tensor, parts: Tensor, k: Tensor, b: Tensor, woven: Tensor, total:
 
 def side_energies(h: Tensor, p: Tensor, rest: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor) -> Tensor:
     heights = torch.stack([h, h, total - h, total - h])
-    repeated = (each.repeat_interleave(2, 0) for each in (k, b, woven))
-    return vmap(crimped_segment)(p, heights, rest, *repeated)
+    return vmap(crimped_segment)(p, heights, rest, k.repeat_interleave(2), b.repeat_interleave(2), woven)
 
 
 def compression(p: Tensor, h: Tensor, rest: Tensor, k: Tensor, b: Tensor, woven: Tensor) -> Tensor:
@@ -143,7 +135,7 @@ def expected_block(q: Tensor, h: Tensor, *parameters: Tensor, sliding: bool) -> 
     """The second derivative of W without what compression takes away, put together from that of every segment; with
     sliding, of the coupling through h that within each yarn alone."""
     parts, k, b, woven, total = parameters
-    p, rest = lengths(q)
+    p, rest = segments_of(q)
 
     def of_all(y: Tensor) -> Tensor:
         return parts @ side_energies(y[8], y[:4], y[4:8], k, b, woven, total)
@@ -153,7 +145,7 @@ def expected_block(q: Tensor, h: Tensor, *parameters: Tensor, sliding: bool) -> 
     for side in range(4):
         sign, mine = (1.0, h) if side < 2 else (-1.0, total - h)
         yarn = side // 2
-        less = parts[side] * compression(p[side], mine, rest[side], k[yarn], b[yarn], woven[yarn])
+        less = parts[side] * compression(p[side], mine, rest[side], k[yarn], b[yarn], woven[side])
         signs = tensor([1.0, sign])
         which = torch.tensor([side, 8])
         second[which[:, None], which[None, :]] -= less * torch.outer(signs, signs)
@@ -163,9 +155,9 @@ def expected_block(q: Tensor, h: Tensor, *parameters: Tensor, sliding: bool) -> 
     reduced = second[:8, :8].clone()
     if second[8, 8] > 0.0:
         reduced -= same * torch.outer(coupling, coupling) / second[8, 8]
-    jacobian = jacrev(lambda q: torch.cat(lengths(q)))(q)
+    jacobian = jacrev(lambda q: torch.cat(segments_of(q)))(q)
     result = jacobian.mT @ reduced @ jacobian
-    bent = hessian(lambda q: lengths(q)[0] @ slopes[:4].clamp(min=0.0))(q)
+    bent = hessian(lambda q: segments_of(q)[0] @ slopes[:4].clamp(min=0.0))(q)
     return result + bent
 
 
@@ -199,7 +191,7 @@ class TestCrimpInterchange(InternalChecks):
 
 @pytest.mark.parametrize("case", cases(("taut",)), ids=str)
 def test_matrix_in_tension_is_exact_or_more_than_half(case: CrimpCase) -> None:
-    """The exact second derivative where yarns do not slide; with sliding, of a first evaluation never less than half."""
+    """Exact where yarns do not slide; with sliding, in a first evaluation never less than half of that."""
     o = case.oracle("crimp_interchange")
     size, n = len(case.q), case.unknowns
     exact = o.interchange.matrix(o.interchange.hessians(case.q), size)

@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, indices, real
+from ..errors import InputError, choice, finite_array, real
 from .topology import Topology, rectangle
 from .weave import Weave
 from .woven import (
     OF_CROSSINGS,
+    Each,
     Numbers,
     Woven,
     check_room,
     checked_crimp,
+    checked_materials,
     checked_of_crossings,
     checked_spacing,
 )
@@ -77,13 +79,13 @@ class Cloth(Woven):
         yarns: Sequence[Yarn],
         warp: Sequence[int] | np.ndarray | None = None,
         weft: Sequence[int] | np.ndarray | None = None,
-        spacing: Any = 1e-3,
+        spacing: Each = 1e-3,
         radius: float = 5e-4,
-        crimp: Any = 0.0,
-        shear: Any = 1000.0,
-        friction: Any = 0.5,
-        friction_stiffness: Any = 1000.0,
-        friction_damping: Any = None,
+        crimp: Each = 0.0,
+        shear: Each = 1000.0,
+        friction: Each = 0.5,
+        friction_stiffness: Each = 1000.0,
+        friction_damping: Each | None = None,
         friction_sharpness: float = 10.0,
         parallel_stiffness: float = 1.0,
         pose: Any = "upright",
@@ -96,9 +98,8 @@ class Cloth(Woven):
         self.yarns = tuple(yarns)
         if not self.yarns or not all(isinstance(yarn, Yarn) for yarn in self.yarns):
             raise InputError(f"yarns = {yarns!r}, must be a list of at least one Yarn")
-        self.warp = self._materials("warp", warp, weave.rows)
-        self.weft = self._materials("weft", weft, weave.columns)
-        self.material = np.concatenate([self.warp, self.weft])
+        self.warp = checked_materials("warp", warp, weave.rows, len(self.yarns))
+        self.weft = checked_materials("weft", weft, weave.columns, len(self.yarns))
         self.spacing = checked_spacing(spacing, weave.rows, weave.columns)
         self.radius = real("radius", radius, above=0.0)
         self.crimp = checked_crimp(crimp, weave.rows, weave.columns)
@@ -107,7 +108,7 @@ class Cloth(Woven):
         self.friction = self._of_crossings("friction", friction)
         self.friction_stiffness = self._of_crossings("friction_stiffness", friction_stiffness)
         if friction_damping is None:
-            damping = 2.0 * np.sqrt(self.friction_stiffness * self._mass_at_a_crossing())
+            damping = 2.0 * np.sqrt(self.friction_stiffness * self.segment_mass)
             self.friction_damping: Numbers = float(damping) if np.ndim(damping) == 0 else damping
         else:
             self.friction_damping = self._of_crossings("friction_damping", friction_damping)
@@ -156,6 +157,11 @@ class Cloth(Woven):
         return rectangle(self.weave)
 
     @property
+    def material(self) -> np.ndarray:  # type: ignore[override]
+        """Material of every yarn, the warp yarns first [rows + columns]."""
+        return np.concatenate([self.warp, self.weft])
+
+    @property
     def stretch_stiffness(self) -> np.ndarray:
         """kₛ = Y · section of every material [materials] (N)."""
         halves = np.array([yarn.halves(self.radius) for yarn in self.yarns])
@@ -192,17 +198,6 @@ class Cloth(Woven):
         bottom = [self.node(-1, 0), self.node(-1, -1)]
         return {"top": top, "bottom": bottom, "all": top + bottom}[which]
 
-    def _materials(self, name: str, value: Sequence[int] | np.ndarray | None, count: int) -> np.ndarray:
-        if value is None:
-            return np.arange(count) % len(self.yarns)
-        if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or np.ndim(value) == 0:
-            raise InputError(f"{name} = {value!r}, must be the materials of {count} yarns, a list of whole numbers")
-        if len(value) != count:
-            raise InputError(f"{name} names the material of {len(value)} yarns, must be of {count}")
-        for k in value:
-            indices(name, [k], len(self.yarns), "material")
-        return np.array(value)
-
     def _measure(self) -> None:
         """Finds where nodes are at rest, sizes and crimps of yarns, and (u, v)."""
         rows, columns = self.weave.rows, self.weave.columns
@@ -233,12 +228,6 @@ class Cloth(Woven):
             warp, weft = (crimp, crimp) if isinstance(crimp, float) else crimp
             self.yarn_crimp = np.concatenate([np.broadcast_to(warp, rows), np.broadcast_to(weft, columns)])
             self.euler = self.rest_grid * (1.0 + self.yarn_crimp[np.stack([row, rows + column], axis=1)])
-
-    def _mass_at_a_crossing(self) -> float:
-        """Computes the mean mass of a segment [kg]."""
-        if isinstance(self.spacing, float) and not self.crimp:
-            return float(np.mean([self.yarns[k].density for k in self.material]) * self.spacing)
-        return self.mass / len(self.topology.segment_nodes)
 
     def _of_crossings(self, name: str, value: Any) -> Numbers:
         return checked_of_crossings(name, value, self.nodes, len(self.yarns))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, finite_array, real
+from ..errors import InputError, finite_array, indices, real
 from .fixed import Fixed
 from .topology import Topology
 from .yarn import Yarn
@@ -28,6 +28,8 @@ OF_CROSSINGS = {
 
 Numbers = float | np.ndarray
 """One number, or one of each."""
+Each = float | Sequence | np.ndarray
+"""As they are given."""
 
 
 class Woven(Fixed):
@@ -134,6 +136,13 @@ class Woven(Fixed):
         yarn = self.topology.segment_yarn
         return float((density[yarn] * (1.0 + self.yarn_crimp[yarn]) * self.segment_spacing).sum())
 
+    @property
+    def segment_mass(self) -> float:
+        """Mean mass of a yarn's part between neighbouring crossings [kg]."""
+        if isinstance(self.spacing, float) and not self.yarn_crimp.any():
+            return float(np.mean([self.yarns[k].density for k in self.material]) * self.spacing)
+        return self.mass / len(self.topology.segment_nodes)
+
     def entries(self, name: str) -> np.ndarray:
         """Tells which entry of one of ``OF_CROSSINGS``, flattened, every node has [nodes]."""
         value = getattr(self, name)
@@ -148,6 +157,19 @@ class Woven(Fixed):
 
 
 # -- what a Cloth is given -------------------------------------------------------------------------------------------
+
+
+def checked_materials(name: str, value: Sequence[int] | np.ndarray | None, count: int, materials: int) -> np.ndarray:
+    """Checks the materials of the yarns of a direction; None: they alternate."""
+    if value is None:
+        return np.arange(count) % materials
+    if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or np.ndim(value) == 0:
+        raise InputError(f"{name} = {value!r}, must be the materials of {count} yarns, a list of whole numbers")
+    if len(value) != count:
+        raise InputError(f"{name} names the material of {len(value)} yarns, must be of {count}")
+    for k in value:
+        indices(name, [k], materials, "material")
+    return np.array(value)
 
 
 def checked_spacing(value: Any, rows: int, columns: int) -> float | tuple[Numbers, Numbers]:

@@ -61,7 +61,7 @@ class Fabric(torch.nn.Module):
         if name in self.rollout.of_yarns:
             return torch.tensor([getattr(yarn, name) for yarn in scene.cloth.yarns], dtype=torch.float64)
         if name in self.rollout.of_crossings:
-            return torch.as_tensor(getattr(scene.cloth, name), dtype=torch.float64)
+            return torch.tensor(getattr(scene.cloth, name), dtype=torch.float64)
         return self.rollout.defaults[name.removeprefix("yarn_").removeprefix("node_")]
 
     def value(self, name: str) -> torch.Tensor:

@@ -88,7 +88,7 @@ class Inputs:
             if getattr(state, name) is not None:
                 inputs[name] = getattr(state, name)
         values = {name: self.checked(name, value) for name, value in inputs.items()}
-        material = torch.as_tensor(self.cloth.material, device=self.device)
+        material = torch.tensor(self.cloth.material, device=self.device)
         for name in self.of_yarns:
             if name in values and f"yarn_{name}" in values:
                 raise InputError(f"{name} and yarn_{name} are both given, must be one of them")
