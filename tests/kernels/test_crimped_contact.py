@@ -110,8 +110,8 @@ def pulled(sim: wy.Simulator, tension: float) -> tuple[wy.State, float]:
 
 @pytest.mark.parametrize("tension", [1.0, 10.0, 19.5, 50.0, 100.0])
 def test_a_flat_cloth_feels_tension(tension: float) -> None:
-    """F_n = 2 T sin θ, tan θ = h/p and h = (4/3) p √c as woven, as a thread over its crossings has it; the yarns' bending,
-    and (1 + c/2)^½ in h, are the rest."""
+    """F_n = 2 T sin θ, tan θ = h/p and h = (4/3) p √c as woven, as a thread over its crossings has it; yarns' bending and
+    √(1 + c/2) in h are the rest."""
     sim = s706("crimped")
     state, distance = pulled(sim, tension)
     height = 4.0 / 3.0 * SPACING * math.sqrt(CRIMP)
@@ -144,9 +144,6 @@ def test_heights_of_both_yarns_make_it() -> None:
         crimped = c.replace(crimp=crimp)
         sim = wy.Simulator(wy.Scene(crimped, contact_force="crimped", terms=("stretch", "shear")))
         state = dataclasses.replace(sim.state, position=1.1 * crimped.position)
-        tension = sim.forces(state)["stretch"][0]
-        warp = tension[crimped.node(2, 0), 0] + tension[crimped.node(2, 0), 0]
-        assert warp > 0.0
         forces.append(sim.contact(state)[1][crimped.node(2, 2)])
     assert 0.4 < forces[1] / forces[0] < 0.6
 
