@@ -26,7 +26,6 @@ from matplotlib.figure import Figure
 from plots import COLORS, PICTURES, save
 
 import warp_yarn as wy
-from warp_yarn.description.crimp import crimp_height
 
 DISTANCE, STRETCH, BEND, DENSITY = 0.5e-3, 120.0, 1e-9, 2e-5
 """p [m] and k_b [N m²] of a cell of Leaf and Kandil; kₛ [N] of cotton's fibres, 6 N/tex, and ρ [kg/m], of 20 tex."""
@@ -42,7 +41,7 @@ KINDS = {
 
 def strip(rows: int, columns: int, crimp: tuple[float, float]) -> wy.Cloth:
     """Yarns that are as thick as they are crimped: at rest as woven."""
-    radius = 0.25 * sum(crimp_height(DISTANCE, DISTANCE * (1.0 + c)) for c in crimp)
+    radius = 0.25 * sum(wy.crimp_height(DISTANCE, DISTANCE * (1.0 + c)) for c in crimp)
     area = np.pi * radius**2
     yarn = wy.Yarn(density=DENSITY, stretch=STRETCH / area, bend=BEND / area)
     weave = wy.Weave.plain(rows=rows, columns=columns)

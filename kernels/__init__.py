@@ -121,9 +121,9 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     wp.set_module_options({"fuse_fp": False}, variant.module("contact"))
     kernels = {
         "contact_normal": crossing_normal.define_normal(variant),
-        "crimped_contact_load": crimped_contact.define(variant),
         "update_anchor": friction.define_anchor(variant),
     }
+    kernels |= vars(crimped_contact.define(variant))
     for term in _OWN:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
@@ -165,6 +165,6 @@ def _build_general(variant: Variant) -> dict[str, wp.Kernel]:
             if term.energy is not None:
                 kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     kernels["update_anchor"] = friction.define_anchor(variant)
-    kernels["crimped_contact_load"] = crimped_contact.define(variant)
+    kernels |= vars(crimped_contact.define(variant))
     kernels |= vars(ros2.define_reversible(variant)) | vars(newton.define_turning(variant.forward))
     return kernels

@@ -10,7 +10,6 @@ from cases import YARNS, Case
 from reference import Oracle
 
 import warp_yarn as wy
-from warp_yarn.description.crimp import crimp_height
 
 CRIMP = (0.05, 0.09)
 
@@ -20,7 +19,7 @@ def cloth(name: str) -> wy.Cloth:
     """A weave whose diameters are 7 % more than goes with its crimps, so that it is not at rest as woven."""
     rows, columns = {"plain": (5, 5), "twill": (6, 6), "satin": (4, 7)}[name]
     spacing = 1e-3
-    diameter = 0.5 * sum(crimp_height(spacing, spacing * (1.0 + c)) for c in CRIMP)
+    diameter = 0.5 * sum(wy.crimp_height(spacing, spacing * (1.0 + c)) for c in CRIMP)
     yarns = [YARNS[:2], YARNS[1:], YARNS[::2]][len(name) % 3]
     return wy.Cloth(
         wy.WEAVES[name](rows=rows, columns=columns),

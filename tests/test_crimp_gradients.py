@@ -11,7 +11,6 @@ from richardson import richardson
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
-from warp_yarn.description.crimp import crimp_height
 
 OPTIONS = {"interchange": {"crimp_interchange": True}, "crimped": {"contact_force": "crimped"}}
 
@@ -54,7 +53,7 @@ DISTANCE, CRIMP, STRETCH, BEND = 0.5e-3, 0.05, 50.0, 1e-9
 def strip(force: float) -> wt.Rollout:
     """A strip of 5 × 7 nodes that is held at its left end, and pulled at every warp yarn of its right end, for so long
     that it comes to rest: ten steps of 10 ms of implicit Euler, which take its motion away."""
-    radius = 0.5 * crimp_height(DISTANCE, DISTANCE * (1.0 + CRIMP))
+    radius = 0.5 * wy.crimp_height(DISTANCE, DISTANCE * (1.0 + CRIMP))
     area = np.pi * radius**2
     c = wy.Cloth(
         wy.Weave.plain(rows=5, columns=7),

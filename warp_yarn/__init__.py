@@ -7,6 +7,7 @@ from types import ModuleType
 from . import moved
 from .description.cloth import Cloth
 from .description.cloths import Cloths
+from .description.crimp import crimp_height
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
@@ -55,6 +56,7 @@ __all__ = [
     "Wind",
     "Yarn",
     "__version__",
+    "crimp_height",
     "fabrics",
     "paper",
     "read_published",

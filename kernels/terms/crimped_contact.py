@@ -9,6 +9,9 @@ with it. On a flat cloth it presses with 2 T sin θ, tan θ = h/p.
 It takes the place of what stretch and bending add to ``contact_load``.
 """
 
+import functools
+from types import SimpleNamespace
+
 import warp as wp
 
 from ..core import general
@@ -17,7 +20,9 @@ from ..core.variant import Variant
 from . import bending, stretch
 
 
-def define(variant: Variant) -> wp.Kernel:
+@functools.cache
+def define(variant: Variant) -> SimpleNamespace:
+    """Define the kernels of both forces, which add the load of every bend."""
     scalar, vec3 = variant.scalar, variant.vec3
     stretch_stiffness = stretch.functions(variant).stiffness
     own = general.functions(variant).own
@@ -30,20 +35,16 @@ def define(variant: Variant) -> wp.Kernel:
         return wp.normalize(crimped) * (stiffness * strain * lengthening)
 
     @variant.kernel("crimp")
-    def crimped_contact_load(
+    def crimped_stretch_load(
         # topology
         bend_nodes: wp.array(dtype=wp.vec3i),
         bend_yarn: wp.array(dtype=int),
         yarn_direction: wp.array(dtype=int),
         # parameters
         stretch: wp.array(dtype=scalar),
-        bend: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
-        spacing: wp.array(dtype=scalar),
         lengthening: wp.array(dtype=scalar),
         contact_offset: wp.array(dtype=scalar),
-        stretches: int,
-        bends: int,
         # state in
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -51,8 +52,7 @@ def define(variant: Variant) -> wp.Kernel:
         # load out
         contact_load: wp.array(dtype=scalar),
     ):
-        """Add the loads of a bend: of the stretch of its two segments on the crossing between, every crossing being
-        between two of each of its yarns."""
+        """Add the load of two segments on the crossing between: every crossing is between two of each of its yarns."""
         e = index(wp.tid())
         a = index(bend_nodes[e][0])
         c = index(bend_nodes[e][1])
@@ -63,24 +63,48 @@ def define(variant: Variant) -> wp.Kernel:
         offset = scalar(-2.0) * half * contact_offset[yarn]
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
-        crimped1 = e1 + (normal[b] - normal[c]) * offset
-        crimped2 = e2 + (normal[a] - normal[c]) * offset
-        before = euler[2 * c + direction] - euler[2 * a + direction]
-        after = euler[2 * b + direction] - euler[2 * c + direction]
-        half_width = radius[own(2 * yarn)]
-        half_thickness = radius[own(2 * yarn + 1)]
-        if stretches != 0:
-            k = stretch_stiffness(stretch[yarn], half_width, half_thickness) * half
-            pressing = tension_along(e1, crimped1, after, k, lengthening[yarn])
-            pressing += tension_along(e2, crimped2, before, k, lengthening[yarn])
-            wp.atomic_add(contact_load, c, wp.dot(normal[c], pressing))
-        if bends != 0:
-            k_b = scalar(2.0) * bend_stiffness(bend[yarn], half_width, half_thickness) / (before + after) * half
-            unit1 = spacing[own(2 * c + direction)]
-            unit2 = spacing[own(2 * a + direction)]
-            pressing_b, pressing_a = bend_forces(crimped1, crimped2, k_b, unit1, unit2)
-            wp.atomic_add(contact_load, a, wp.dot(normal[a], pressing_a))
-            wp.atomic_add(contact_load, b, wp.dot(normal[b], pressing_b))
-            wp.atomic_add(contact_load, c, -wp.dot(normal[c], pressing_a + pressing_b))
+        rest1 = euler[2 * b + direction] - euler[2 * c + direction]
+        rest2 = euler[2 * c + direction] - euler[2 * a + direction]
+        k = stretch_stiffness(stretch[yarn], radius[own(2 * yarn)], radius[own(2 * yarn + 1)]) * half
+        pressing = tension_along(e1, e1 + (normal[b] - normal[c]) * offset, rest1, k, lengthening[yarn])
+        pressing += tension_along(e2, e2 + (normal[a] - normal[c]) * offset, rest2, k, lengthening[yarn])
+        wp.atomic_add(contact_load, c, wp.dot(normal[c], pressing))
 
-    return crimped_contact_load
+    @variant.kernel("crimp")
+    def crimped_bending_load(
+        # topology
+        bend_nodes: wp.array(dtype=wp.vec3i),
+        bend_yarn: wp.array(dtype=int),
+        yarn_direction: wp.array(dtype=int),
+        # parameters
+        bend: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+        spacing: wp.array(dtype=scalar),
+        contact_offset: wp.array(dtype=scalar),
+        # state in
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vec3),
+        # load out
+        contact_load: wp.array(dtype=scalar),
+    ):
+        e = index(wp.tid())
+        a = index(bend_nodes[e][0])
+        c = index(bend_nodes[e][1])
+        b = index(bend_nodes[e][2])
+        yarn = index(bend_yarn[e])
+        direction = index(yarn_direction[yarn])
+        half = scalar(0.5) - scalar(direction)
+        offset = scalar(-2.0) * half * contact_offset[yarn]
+        e1 = position[b] - position[c] + (normal[b] - normal[c]) * offset
+        e2 = position[a] - position[c] + (normal[a] - normal[c]) * offset
+        rest = euler[2 * b + direction] - euler[2 * a + direction]
+        k_b = bend_stiffness(bend[yarn], radius[own(2 * yarn)], radius[own(2 * yarn + 1)])
+        unit1 = spacing[own(2 * c + direction)]
+        unit2 = spacing[own(2 * a + direction)]
+        pressing_b, pressing_a = bend_forces(e1, e2, scalar(2.0) * k_b / rest * half, unit1, unit2)
+        wp.atomic_add(contact_load, a, wp.dot(normal[a], pressing_a))
+        wp.atomic_add(contact_load, b, wp.dot(normal[b], pressing_b))
+        wp.atomic_add(contact_load, c, -wp.dot(normal[c], pressing_a + pressing_b))
+
+    return SimpleNamespace(crimped_stretch_load=crimped_stretch_load, crimped_bending_load=crimped_bending_load)

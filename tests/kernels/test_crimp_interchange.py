@@ -11,14 +11,16 @@ import warp as wp
 from cases import Case
 from checks import InternalChecks, check_definite, error, matrix
 from crimped import CrimpCase, cases, cloth, scene
+from internals import has_any, stiffness_at_evaluation
 from reference import Tensor, clamped, crimped_crossing, crimped_segment, segments_of, tensor
 from scipy.optimize import brentq
 from torch.func import grad, hessian, jacrev, vmap
 from warp_yarn.kernels import Variant, build
+from warp_yarn.kernels.terms.crimped_segment import ROUND
 
 import warp_yarn as wy
-from warp_yarn.description.crimp import crimp_height, interchange
-from warp_yarn.simulation.linear_system import read_system
+from warp_yarn.description import crimp as description
+from warp_yarn.description.crimp import interchange
 
 ROUNDING = 1e-13
 """As of all terms; of h, which is found to 1e-13 and then once more."""
@@ -135,11 +137,7 @@ def test_matrix_in_tension_is_exact_or_more_than_half(case: CrimpCase) -> None:
 def test_matrix_of_every_second_evaluation(case: CrimpCase) -> None:
     """That of the positions with Δs held, and ten times that of each Δs; apart, and so definite."""
     sim = wy.Simulator(case.simulator("crimp_interchange").scene, integrator="linear")
-    sim.state = case.state
-    sim.arrays.put("evaluations", 1)
-    sim.arrays.put("coefficients", 0.0, 0.0, 1.0)
-    sim.model.assemble()
-    found, n = read_system(sim.model).dense(), 3 * case.cloth.nodes
+    found, n = stiffness_at_evaluation(sim, case.state, 1), 3 * case.cloth.nodes
     check_definite(found)
     first, whole = matrix(sim, case.state, stiffness=1.0), expected_matrix(case, sliding=False)
     assert error(found[:n, :n], whole[:n, :n]) < 1e-11
@@ -181,7 +179,7 @@ def test_every_segment_is_shared_out_once(name: str) -> None:
 @functools.cache
 def cell(distance: float, length: float, stretch: float, bend: float = 1e-9, size: int = 5) -> wy.Simulator:
     """A square plain weave of one yarn, kₛ = stretch [N], k_b = bend [N m²], at rest as woven."""
-    radius = 0.5 * crimp_height(distance, length)
+    radius = 0.5 * wy.crimp_height(distance, length)
     area = math.pi * radius**2
     yarn = wy.Yarn(density=2e-5, stretch=stretch / area, bend=bend / area)
     c = wy.Cloth(
@@ -222,11 +220,15 @@ def test_moduli_of_leaf_and_kandil(degrees: float, expected: float) -> None:
     assert abs(-(ends[0][1] - ends[1][1]) / (2.0 * strain) - 1.0) < 0.01
 
 
+def test_both_sides_round_yarns_alike() -> None:
+    assert ROUND == description.ROUND == 9.0 / 8.0
+
+
 @pytest.mark.parametrize("crimp", [0.01, 0.05, 0.1])
 def test_heights_of_peirce(crimp: float) -> None:
     """h = (4/3) p √c, and h₁ + h₂ = d₁ + d₂ of a cloth at rest, whose yarns neither pull nor press."""
     distance = 0.5e-3
-    found = crimp_height(distance, distance * (1.0 + crimp))
+    found = wy.crimp_height(distance, distance * (1.0 + crimp))
     assert abs(found / (4.0 / 3.0 * distance * math.sqrt(crimp)) - 1.0) < 0.03
     sim = cell(distance, distance * (1.0 + crimp), 200.0)
     assert abs(2.0 * found / (4.0 * sim.scene.cloth.radius) - 1.0) < 1e-12
@@ -238,7 +240,7 @@ def test_heights_of_peirce(crimp: float) -> None:
 def test_unequal_crimps_have_the_ratio_of_leaf_and_kandil() -> None:
     """ν₁₂ = p₂ tan θ₂/(p₁ tan θ₁) of yarns as long as 1.04 and 1.1 times what they cover, and the reverse."""
     distance, crimps = 0.5e-3, (0.04, 0.1)
-    radius = 0.25 * sum(crimp_height(distance, distance * (1.0 + c)) for c in crimps)
+    radius = 0.25 * sum(wy.crimp_height(distance, distance * (1.0 + c)) for c in crimps)
     area, found = math.pi * radius**2, []
     for crimp in (crimps, crimps[::-1]):
         c = wy.Cloth(
@@ -282,7 +284,7 @@ def test_there_is_nothing_of_it_in_other_scenes() -> None:
     assert "crimp_interchange" not in sim.scene.terms
     assert "stretch" in sim.scene.terms
     assert "stretch" not in scene("plain", None, True).terms
-    assert not {"crimp_sides", "crimp_around", "crimp_corners", "contact_offset"} & set(sim.arrays)
+    assert not has_any(sim, "crimp_sides", "crimp_around", "crimp_corners", "contact_offset")
 
 
 def test_single_precision() -> None:
@@ -298,6 +300,6 @@ def test_single_precision() -> None:
 def test_modules_of_their_own() -> None:
     """Who has no such scene compiles none of it."""
     kernels = build(Variant(wp.float64, True))
-    for name in ("crimp_interchange", "crimp_interchange_energy", "crimped_contact_load"):
+    for name in ("crimp_interchange", "crimp_interchange_energy", "crimped_stretch_load", "crimped_bending_load"):
         assert "crimp" in kernels[name].module.name
     assert "crimp" not in kernels["stretch"].module.name

@@ -110,7 +110,7 @@ def pulled(sim: wy.Simulator, tension: float) -> tuple[wy.State, float]:
 
 @pytest.mark.parametrize("tension", [1.0, 10.0, 19.5, 50.0, 100.0])
 def test_a_flat_cloth_feels_tension(tension: float) -> None:
-    """F_n = 2 T sin θ, tan θ = h/p and h = (4/3) p √c as woven, as a thread over its crossings has it; yarns' bending and
+    """F_n = 2 T sin θ, tan θ = h/p and h = (4/3) p √c as woven, as a thread over its crossings; yarns' bending and
     √(1 + c/2) in h are the rest."""
     sim = s706("crimped")
     state, distance = pulled(sim, tension)

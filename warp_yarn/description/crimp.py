@@ -6,8 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ..kernels.terms.crimp_interchange import ROUND
+from ..errors import InputError, choice
 from .woven import Woven
+
+CONTACT_FORCES = ("published", "crimped")
+ROUND = 9.0 / 8.0
+"""β², by which yarns are round at their bends, as of ``kernels/terms/crimped_segment.py``."""
 
 
 def crimp_height(distance: Any, length: Any) -> Any:
@@ -33,17 +37,27 @@ def heights(cloth: Woven) -> np.ndarray:
     return crimp_height(distance, distance * (1.0 + cloth.yarn_crimp))
 
 
-def lacks_crimp(cloth: Woven) -> str:
-    """Says that no yarn is crimped, or ""."""
-    return "" if cloth.yarn_crimp.any() else "the cloth has no crimp, must be above 0 in the warp or the weft"
+def check_crimp(cloth: Woven, contact_force: str, interchange: bool) -> None:
+    """Refuses what a scene says of crimp where it does not go together, or the cloth is not for it.
 
-
-def lacks_bending(cloth: Woven) -> str:
-    """Says which yarn does not resist bending, or ""."""
+    Raises:
+        InputError: the argument, its value, and what it must be.
+    """
+    choice("contact_force", contact_force, CONTACT_FORCES)
+    crimped = contact_force == "crimped"
+    if interchange and crimped:
+        raise InputError(
+            "contact_force = 'crimped', must be 'published' with crimp_interchange, whose contact force is its own"
+        )
+    if (interchange or crimped) and not cloth.yarn_crimp.any():
+        wanted = "crimp_interchange = True" if interchange else "contact_force = 'crimped'"
+        raise InputError(f"{wanted}, but the cloth has no crimp, must be above 0 in the warp or the weft")
     for k, yarn in enumerate(cloth.yarns):
-        if yarn.bend == 0.0:
-            return f"yarns[{k}].bend = 0, must be above 0: nothing would say how high a slack yarn is"
-    return ""
+        if interchange and yarn.bend == 0.0:
+            raise InputError(
+                f"crimp_interchange = True, but yarns[{k}].bend = 0, must be above 0: nothing would say how high a "
+                "slack yarn is"
+            )
 
 
 def interchange(cloth: Woven) -> dict[str, np.ndarray]:

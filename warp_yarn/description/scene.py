@@ -13,11 +13,9 @@ from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
 from .cloth import Cloth
 from .cloths import Cloths, as_one
-from .crimp import lacks_bending, lacks_crimp
+from .crimp import check_crimp
 from .fixed import Fixed
 from .obstacles import Contact, Obstacle
-
-CONTACT_FORCES = ("published", "crimped")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -116,9 +114,9 @@ class Scene(Fixed):
         if contact is not None and not isinstance(contact, Contact):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
-        self.contact_force = choice("contact_force", contact_force, CONTACT_FORCES)
+        self.contact_force = contact_force
         self.crimp_interchange = bool(crimp_interchange)
-        self._check_crimp()
+        check_crimp(self.cloth, contact_force, self.crimp_interchange)
         self.terms = self._terms(terms)
         self._fix(
             cloth=self.cloth,
@@ -196,19 +194,6 @@ class Scene(Fixed):
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
-
-    def _check_crimp(self) -> None:
-        """Refuses what needs crimp that is not there."""
-        if self.crimp_interchange and self.contact_force == "crimped":
-            raise InputError(
-                "contact_force = 'crimped', must be 'published' with crimp_interchange, whose contact force is its own"
-            )
-        wanted = "crimp_interchange = True" if self.crimp_interchange else f"contact_force = {self.contact_force!r}"
-        crimped = self.crimp_interchange or self.contact_force == "crimped"
-        lacks = lacks_crimp(self.cloth) if crimped else ""
-        lacks = lacks or (lacks_bending(self.cloth) if self.crimp_interchange else "")
-        if lacks:
-            raise InputError(f"{wanted}, but {lacks}")
 
     def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
         if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):

@@ -225,13 +225,12 @@ CONTACT_INPUTS: Group = {
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
 
-CRIMP: Group = {
+CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
     "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
     "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
     "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
     "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
 }
-"""Of crimp interchange, and of the contact force at crimped positions. Others have none of it."""
 
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
@@ -344,8 +343,6 @@ STAGE_ADJOINT: Group = {
 LAUNCH: Group = {
     "matrix": Field("launch", 1, "int", "", "always", "whether a term is to fill the matrix"),
     "add_contact_load": Field("launch", 1, "int", "", "always", "whether a term is to add to ``contact_load``"),
-    "stretches": Field("launch", 1, "int", "", "always", "whether the scene has stretch"),
-    "bends": Field("launch", 1, "int", "", "always", "whether the scene has bending"),
     "stage": Field("launch", 1, "int", "", "always", "which stage of the step, from 0"),
     "along": Field("launch", 1, "int", "", "always", "direction of lines: 0 warp, 1 weft"),
     "first": Field("launch", 1, "int", "", "always", "first node of a level"),
