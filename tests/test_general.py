@@ -13,6 +13,7 @@ import torch
 import warp_yarn.learn as wl
 from cases import GENERAL, cloth
 from inputs import EXACT, WIND, jittered, scaled
+from reference import Oracle, tensor
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
@@ -178,6 +179,53 @@ def test_a_cloth_of_two_setts_stretches_by_its_yarns() -> None:
     sections = np.pi * np.array([3e-4 * 1e-4 if j % 2 == 0 else 4e-8 for j in range(5)])
     # kₛ (1 + c)(|w| (1 + c) − 1) = kₛ (1 + c) · strain
     assert pulled == pytest.approx(5e5 * sections * 1.1 * strain, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_numbers(seed: int) -> None:
+    """Forces are the oracle's, whatever the numbers are, and a run ends well or in an error of ours."""
+    random = np.random.default_rng(seed)
+    rows, columns, kinds = (int(n) for n in random.integers((3, 3, 1), (6, 7, 4)))
+    gaps = [10.0 ** random.uniform(-3.5, -2.5, n - 1) for n in (rows, columns)]
+    room = min(gap.min() for gap in gaps)
+    yarns = [
+        wy.Yarn(
+            density=10.0 ** random.uniform(-5, -3),
+            stretch=10.0 ** random.uniform(4, 8),
+            bend=10.0 ** random.uniform(-5, -3),
+            width=room * random.uniform(0.1, 1.0),
+            thickness=room * random.uniform(0.05, 1.0),
+        )
+        for _ in range(kinds)
+    ]
+    c = wy.Cloth(
+        wy.Weave(random.integers(0, 2, (rows, columns))),
+        yarns=yarns,
+        spacing=tuple(gaps),
+        crimp=tuple(random.uniform(0.0, 0.2, n) for n in (rows, columns)),
+        shear=random.uniform(10.0, 1e5, (kinds, kinds)),
+        friction=random.uniform(0.0, 1.0, rows * columns),
+        pose="flat",
+    )
+    scene = hung(c)
+    simulator, oracle = wy.Simulator(scene), Oracle(scene)
+    state = simulator.state
+    state.position += 0.1 * room * random.uniform(-1.0, 1.0, state.position.shape)
+    inside = (c.topology.is_crossing != 0)[:, None]
+    state.euler += 0.1 * room * random.uniform(-1.0, 1.0, state.euler.shape) * inside
+    q = tensor(np.concatenate([state.position.ravel(), state.euler.ravel()]))
+    still = torch.zeros_like(q)
+    for term, (x, s) in simulator.forces(state).items():
+        expected = oracle.force(term, q, still, tensor(state.anchor.ravel())).numpy()
+        found = np.concatenate([x.ravel(), s.ravel()])
+        # of sums of some tens of numbers, and of a normal whose gap is some 1e-2
+        assert np.abs(found - expected).max() <= 1e-11 * max(np.abs(expected).max(), 1e-12), term
+    simulator.state = state
+    try:
+        run = simulator.run(20)
+    except wy.SimulationError as error:
+        run = error.trajectory
+    assert np.isfinite(run.position).all() and np.isfinite(run.euler).all()
 
 
 def test_several_cloths_of_different_numbers_move_as_they_do_alone() -> None:

@@ -87,7 +87,7 @@ def test_arrays_are_as_declared(name, options, sliding):
     segments = rows * (columns - 1) + columns * (rows - 1)
     sizes = {"world": 1, "node": nodes, "segment": segments, "yarn": rows + columns, "crossing": crossings}
     sizes["frame node"] = 4 * nodes
-    numbers = {"gap": 2 * nodes, "half": 2 * (rows + columns), "corner": 4 * crossings, "cloth crossing": nodes}
+    numbers = {"gap": 4 * nodes, "half": 3 * (rows + columns), "corner": 4 * crossings, "cloth crossing": nodes}
     sizes |= numbers if name == "general" else dict.fromkeys(numbers, 1)
     for name, array in arrays.items():
         if name == "levels":

@@ -151,8 +151,8 @@ class Arrays(DeclaredArrays):
             elif not general or name not in ("spacing", "radius"):
                 self[name] = self.numbers(getattr(cloth, name))
         if general:
-            self["spacing"] = self.numbers(cloth.node_spacing.ravel())
-            self["radius"] = self.numbers(cloth.halves.ravel())
+            self["spacing"] = self.numbers(np.concatenate([cloth.node_spacing, cloth.node_widths]).ravel())
+            self["radius"] = self.numbers(np.append(cloth.halves, 1.0 + cloth.yarn_crimp))
             self["lock_angle"] = self.numbers(cloth.corner_lock.ravel())
         else:
             self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
@@ -209,8 +209,8 @@ def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:
     """Count what the numbers of a cloth are of: one of each in a plain cloth."""
     topology = cloth.topology
     counts = {
-        "gap": 2 * topology.nodes,
-        "half": 2 * len(topology.yarn_direction),
+        "gap": 4 * topology.nodes,
+        "half": 3 * len(topology.yarn_direction),
         "corner": 4 * len(topology.crossing_node),
         "cloth crossing": topology.nodes,
     }

@@ -39,8 +39,8 @@ PARAMETERS: Group = {
     "density": Field("yarn", 1, "scalar", "kg/m", "always", "ρ"),
     "stretch": Field("yarn", 1, "scalar", "Pa", "always", "stretch modulus Y"),
     "bend": Field("yarn", 1, "scalar", "Pa m²", "always", "bending modulus B"),
-    "spacing": Field("gap", 1, "scalar", "m", "always", "L"),
-    "radius": Field("half", 1, "scalar", "m", "always", "R; of each yarn half the width and half the thickness"),
+    "spacing": Field("gap", 1, "scalar", "m", "always", "L; and half the widths of a node's yarns"),
+    "radius": Field("half", 1, "scalar", "m", "always", "R, half the width and half the thickness; and 1 + crimp"),
     "lengthening": Field("yarn", 1, "scalar", "", "general", "1 + crimp: length over the distance that it covers"),
     "shear": Field("cloth crossing", 1, "scalar", "Pa", "always", "shear modulus S"),
     "friction": Field("cloth crossing", 1, "scalar", "", "always", "μ"),
@@ -52,8 +52,8 @@ PARAMETERS: Group = {
     "published_scaling": Field("count", 1, "int", "", "always", "1: friction with arguments in SI units, as published"),
 }
 """What a scene says of its yarns and its cloth. A plain cloth has one gap, half, corner and cloth crossing; a general
-one (``kernels/core/general.py``) two gaps of each node, two halves of each yarn, four corners of each crossing, and as
-many cloth crossings as nodes."""
+one (``kernels/core/general.py``) four gaps of each node, three halves of each yarn, four corners of each crossing, and
+as many cloth crossings as nodes."""
 
 INPUTS: Group = {
     "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g"),
