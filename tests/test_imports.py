@@ -59,7 +59,8 @@ ONLY = {
 """Where a package may be imported at all; render.py asks for PyVista by name."""
 
 BETWEEN_TERMS = {(f"{K}.terms.jamming", f"{K}.terms.stretch")}
-"""The barrier between crossings takes k_s of the yarn from there."""
+BETWEEN_TERMS |= {(f"{K}.terms.crimp_interchange", f"{K}.terms.{name}") for name in ("stretch", "bending")}
+"""The barrier between crossings takes k_s of the yarn from there, and crimp interchange k_b too."""
 
 
 def modules() -> dict[str, Path]:

@@ -7,6 +7,7 @@ from types import ModuleType
 from . import moved
 from .description.cloth import Cloth
 from .description.cloths import Cloths
+from .description.crimp import crimp_height
 from .description.draft import Draft
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
@@ -59,6 +60,7 @@ __all__ = [
     "Wind",
     "Yarn",
     "__version__",
+    "crimp_height",
     "fabrics",
     "paper",
     "read_draft",

@@ -154,6 +154,7 @@ TERM = Term(
     define=define,
     energy=define_energy,
     parameters=(TermParameter("stretch", "Pa", least=0.0, of="yarn"),),
+    absent=lambda scene: "crimp_interchange takes its place" if scene.crimp_interchange else "",
     stencil=2,
     presses=True,
     energy_watched_as="elastic_energy",

@@ -17,7 +17,7 @@ from warp_yarn.device.fields import Field
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
 VARIANTS += [dataclasses.replace(variant, general=True) for variant in VARIANTS[:4]]
 STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAdjoint", "Levels"}
-STRUCTS |= {"Pairs", "Obstacles", "Faces"}
+STRUCTS |= {"Pairs", "Obstacles", "Faces", "Crimp"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
 """Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""

@@ -18,7 +18,7 @@ from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
-from . import contact, declarations
+from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
 
@@ -72,6 +72,7 @@ class Arrays(DeclaredArrays):
         for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
             self.make(group)
         contact.set_arrays(self)
+        crimp.set_arrays(self)
 
     def node_mass(self) -> float:
         """Compute the mean mass of a node [kg]."""

@@ -225,6 +225,13 @@ CONTACT_INPUTS: Group = {
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
 
+CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
+    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
+    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
+    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
+    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
+}
+
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
     "increment": Field("node", 1, "vec3", "m/s", "always", "velocities whose momentum the right-hand side has"),
@@ -375,6 +382,7 @@ GROUPS: dict[str, Group] = {
     "Levels": LEVELS,
     "Contact": CONTACT,
     "ContactInputs": CONTACT_INPUTS,
+    "Crimp": CRIMP,
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,
