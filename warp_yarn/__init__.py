@@ -8,6 +8,7 @@ from . import moved
 from .description.cloth import Cloth
 from .description.cloths import Cloths
 from .description.draft import Draft
+from .description.fibre import FIBRES, Fibre
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
@@ -31,6 +32,7 @@ moved.install()
 __version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
+    "FIBRES",
     "WEAVES",
     "Box",
     "Capsule",
@@ -39,6 +41,7 @@ __all__ = [
     "Contact",
     "Cylinder",
     "Draft",
+    "Fibre",
     "GradientError",
     "InputError",
     "Plane",
