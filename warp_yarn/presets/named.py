@@ -1,4 +1,4 @@
-"""What a fabric by name is made of: the numbers of its data sheet, each with its source, and the cloth that they make."""
+"""What a fabric by name is made of: the numbers of its data sheet with their sources, and the cloth that they make."""
 
 from __future__ import annotations
 
@@ -110,7 +110,8 @@ class NamedFabric:
         softer = 1.0
         if "bending" in sheet:
             softer = self._number("bending") / float(np.mean(self._bends(free)))
-        self.yarns = tuple(dataclasses.replace(yarn, bend=softer * yarn.bend) for yarn in free)
+        warp_yarn, weft_yarn = (dataclasses.replace(yarn, bend=softer * yarn.bend) for yarn in free)
+        self.yarns = warp_yarn, weft_yarn
         (warp, _), (weft, _) = (yarn.halves(math.nan) for yarn in self.yarns)
         self.shear = self._number("shear") / (2.0 * math.pi * warp * weft * sum(1.0 / each for each in self.spacing))
         densities = zip(self.yarns, self.crimp, self.spacing, strict=True)
@@ -170,18 +171,21 @@ class NamedFabric:
             raise InputError(f"size = {size!r}, must be a number, or two: along the warp, and along the weft")
         return size[0], size[1]
 
-    def _number(self, key: str, none: float | None = None) -> float:
-        return none if key not in self._sheet and none is not None else float(self._sheet[key].value)
+    def _number(self, key: str, none: float = math.nan) -> float:
+        return float(self._sheet[key].value) if key in self._sheet else none
 
     def _yarn(self, side: str) -> Yarn:
         """Makes a yarn that bends as its fibres do."""
-        given = {name: self._sheet.get(f"{side}_{name}") for name in ("width", "thickness")}
         return Yarn.from_tex(
             self._number(f"{side}_tex"),
             self._sheet[f"{side}_fibre"].value,
             twist=self._number(f"{side}_twist", 0.0),
-            **{name: float(datum.value) for name, datum in given.items() if datum is not None},
+            width=self._size(f"{side}_width"),
+            thickness=self._size(f"{side}_thickness"),
         )
+
+    def _size(self, key: str) -> float | None:
+        return self._number(key) if key in self._sheet else None
 
     def _bends(self, yarns: tuple[Yarn, Yarn]) -> list[float]:
         """Gives the cloth's bending stiffness along the warp, and along the weft [N m]."""
@@ -210,6 +214,40 @@ class NamedFabric:
         fitted = self._sheet["shear"].kind == "measured"
         made["modulus"] = Datum(self.shear, "fitted" if fitted else "derived", "shear of the cloth")
         return made
+
+
+def tables(fabrics: Mapping[str, NamedFabric]) -> str:
+    """Writes all numbers of fabrics with their sources, a table of Markdown for each."""
+    written = []
+    for name, fabric in fabrics.items():
+        rows = [f"### {name}\n\n{fabric.name}\n\n| | value | | |\n|---|---|---|---|"]
+        for key, datum in _once(fabric.sources).items():
+            value = _written(datum.value, UNITS[key.split(", ")[0]])
+            rows.append(f"| {key} | {value} | {datum.kind} | {datum.source} |")
+        written.append("\n".join(rows))
+    return "\n\n".join(written)
+
+
+def _written(value: Any, unit: str) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{100.0 * part:g} % {name}" for name, part in value.items())
+    return value if isinstance(value, str) else f"{value:.4g} {unit}".removesuffix(" 1")
+
+
+def _once(sources: Mapping[str, Datum]) -> dict[str, Datum]:
+    """Says once what warp and weft have alike."""
+    alike = {
+        key.partition("_")[2]
+        for key, datum in sources.items()
+        if key.startswith("warp_") and sources.get(f"weft_{key.partition('_')[2]}") == datum
+    }
+    result = {}
+    for key in UNITS:
+        side, _, name = key.partition("_")
+        if key not in sources or (side == "weft" and name in alike):
+            continue
+        result[f"{key}, weft_{name}" if side == "warp" and name in alike else key] = sources[key]
+    return result
 
 
 def stiffness(yarn: Yarn) -> tuple[float, float]:
