@@ -11,6 +11,7 @@ The field ``when`` names a condition of the scene (``fields.conditions``). Where
 
 import dataclasses
 
+from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
 from .fields import Field, Group
 
 TOPOLOGY: Group = {
@@ -30,6 +31,7 @@ TOPOLOGY: Group = {
     "is_crossing": Field("node", 1, "int", "", "always", "1 at a crossing, 0 on the border"),
     "is_free": Field("node", 1, "int", "", "always", "0 where a hard pin holds a node, else 1"),
     "flipped": Field("node", 1, "int", "", "always", "the draft: which yarn is on top"),
+    "node_yarns": Field("node", 2, "int", "", "general", "its warp yarn and its weft yarn, or -1"),
     "neighbour": Field("block", 1, "int", "", "always", "upper neighbours of a node in the matrix, or -1"),
 }
 """Index arrays (``description/topology.py``)."""
@@ -38,18 +40,21 @@ PARAMETERS: Group = {
     "density": Field("yarn", 1, "scalar", "kg/m", "always", "ρ"),
     "stretch": Field("yarn", 1, "scalar", "Pa", "always", "stretch modulus Y"),
     "bend": Field("yarn", 1, "scalar", "Pa m²", "always", "bending modulus B"),
-    "spacing": Field("cloth", 1, "scalar", "m", "always", "L"),
-    "radius": Field("cloth", 1, "scalar", "m", "always", "R"),
-    "shear": Field("cloth", 1, "scalar", "Pa", "always", "shear modulus S"),
-    "friction": Field("cloth", 1, "scalar", "", "always", "μ"),
-    "friction_stiffness": Field("cloth", 1, "scalar", "N/m", "always", "k_f"),
-    "friction_damping": Field("cloth", 1, "scalar", "N s/m", "always", "d_f"),
+    "spacing": Field("gap", 1, "scalar", "m", "always", "L; and half the widths of a node's yarns"),
+    "radius": Field("half", 1, "scalar", "m", "always", "R, half the width and half the thickness; and 1 + crimp"),
+    "lengthening": Field("yarn", 1, "scalar", "", "general", "1 + crimp: length over the distance that it covers"),
+    "shear": Field("cloth crossing", 1, "scalar", "Pa", "always", "shear modulus S"),
+    "friction": Field("cloth crossing", 1, "scalar", "", "always", "μ"),
+    "friction_stiffness": Field("cloth crossing", 1, "scalar", "N/m", "always", "k_f"),
+    "friction_damping": Field("cloth crossing", 1, "scalar", "N s/m", "always", "d_f"),
     "friction_sharpness": Field("cloth", 1, "scalar", "", "always", "p of the law's tanh"),
     "parallel_stiffness": Field("cloth", 1, "scalar", "N/m", "always", "k_c"),
-    "lock_angle": Field("cloth", 1, "scalar", "rad", "always", "φ_l = 2 arcsin(R/L)"),
+    "lock_angle": Field("corner", 1, "scalar", "rad", "always", "φ_l = 2 arcsin(R/L)"),
     "published_scaling": Field("count", 1, "int", "", "always", "1: friction with arguments in SI units, as published"),
 }
-"""What a scene says of its yarns and its cloth."""
+"""What a scene says of its yarns and its cloth. A plain cloth has one gap, half, corner and cloth crossing; a general
+one (``kernels/core/general.py``) four gaps of each node, three halves of each yarn, four corners of each crossing, and
+as many cloth crossings as nodes."""
 
 INPUTS: Group = {
     "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g, in this step"),
@@ -175,54 +180,6 @@ LEVELS: Group = {
     "coarse_z": Field("coarse node", 1, "vec3", "m/s", "always", "preconditioned residual"),
 }
 """Of the multilevel preconditioner (``description/levels.py``): one struct, ``arrays["levels"]``."""
-
-CONTACT: Group = {
-    "touching": Field("world", 3, "int", "", "always", "whether anything touches, two nodes, anything so fast"),
-    "obstacle_velocity": Field("obstacle", 1, "vec3", "m/s", "obstacles", "ṗ"),
-    "obstacle_spin": Field("obstacle", 1, "vec3", "rad/s", "obstacles", "ω"),
-    "face_room": Field("count", 1, "int", "", "always", "places of a node in the list of faces that are near"),
-    "face_count": Field("node", 1, "int", "", "obstacles", "how many of them are taken"),
-    "near_face": Field("near face", 1, "int", "", "obstacles", "faces that are near it, of all meshes"),
-    "near_room": Field("count", 1, "int", "", "always", "places of a node in the list of what is near"),
-    "near_count": Field("node", 1, "int", "", "self-contact", "how many of them are taken"),
-    "near": Field("near", 1, "int", "", "self-contact", "nodes that are near it"),
-    "near_block": Field("near", 1, "sym33", "kg", "self-contact", "matrix block of those that touch it, or 0"),
-    "near_position": Field("node", 1, "vec3", "m", "self-contact", "where nodes were when the list was made"),
-    "outdated": Field("world", 1, "int", "", "self-contact", "whether it has to be made anew"),
-}
-"""What contact finds (``kernels/contact``)."""
-
-CONTACT_INPUTS: Group = {
-    "contact_stiffness": Field("world", 1, "scalar", "N/m", "obstacles", "κ of nodes on obstacles"),
-    "contact_distance": Field("world", 1, "scalar", "m", "obstacles", "D"),
-    "contact_range": Field("world", 1, "scalar", "m", "obstacles", "d̂"),
-    "contact_slip_speed": Field("world", 1, "scalar", "m/s", "obstacles", "ε"),
-    "contact_damping_speed": Field("world", 1, "scalar", "m/s", "obstacles", "v_d"),
-    "self_contact_stiffness": Field("world", 1, "scalar", "N/m", "self-contact", "κ of nodes on nodes"),
-    "self_contact_distance": Field("world", 1, "scalar", "m", "self-contact", "D"),
-    "self_contact_range": Field("world", 1, "scalar", "m", "self-contact", "d̂"),
-    "self_contact_slip_speed": Field("world", 1, "scalar", "m/s", "self-contact", "ε"),
-    "self_contact_damping_speed": Field("world", 1, "scalar", "m/s", "self-contact", "v_d"),
-    "contact_friction": Field("world", 1, "scalar", "", "self-contact", "μ of cloth on cloth"),
-    "near_margin": Field("world", 1, "scalar", "m", "self-contact", "beyond D + d̂ of the list of what is near"),
-    "rest_place": Field("node", 2, "scalar", "m", "self-contact", "(u, v) at rest, far apart on different cloths"),
-    "obstacle_shape": Field("obstacle", 1, "int", "", "obstacles", "as contact/distances.py numbers them"),
-    "obstacle_size": Field("obstacle", 1, "vec3", "m", "obstacles", "what a shape has for numbers"),
-    "obstacle_friction": Field("obstacle", 1, "scalar", "", "obstacles", "μ"),
-    "obstacle_position": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of a stage"),
-    "obstacle_rotation": Field("obstacle", 1, "quat", "", "obstacles", "R"),
-    "obstacle_position_before": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of the state before"),
-    "obstacle_rotation_before": Field("obstacle", 1, "quat", "", "obstacles", "R"),
-    "obstacle_position_start": Field("obstacle", 1, "vec3", "m", "obstacles move", "p before the first step"),
-    "obstacle_rotation_start": Field("obstacle", 1, "quat", "", "obstacles move", "R"),
-    "obstacle_position_path": Field("obstacle step", 1, "vec3", "m", "obstacles move", "p after every step"),
-    "obstacle_rotation_path": Field("obstacle step", 1, "quat", "", "obstacles move", "R"),
-    "meshes": Field("obstacle", 1, "uint64", "", "obstacles", "Warp's mesh, or 0"),
-    "first_face": Field("obstacle", 1, "int", "", "obstacles", "of a mesh, among all faces"),
-    "face_obstacle": Field("face", 1, "int", "", "obstacles", "the mesh of a face"),
-    "mesh_corner": Field("face", 3, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
-}
-"""What a scene says of contact. What it does not have is not in the arrays at all."""
 
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
@@ -375,6 +332,7 @@ GROUPS: dict[str, Group] = {
     "Levels": LEVELS,
     "Contact": CONTACT,
     "ContactInputs": CONTACT_INPUTS,
+    "Crimp": CRIMP,
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,

@@ -50,6 +50,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
     holds = {
         "always": True,
         "sliding": variant.sliding,
+        "general": variant.general,
         "contact": any(term.needs_contact for term in terms),
         "friction": "friction" in names,
         "shear": "shear" in names or others,
@@ -68,5 +69,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "obstacles": len(scene.obstacles) > 0 and scene.has_barrier,
         "obstacles move": scene.has_barrier and any(obstacle.path is not None for obstacle in scene.obstacles),
         "self-contact": scene.self_contact and scene.has_barrier,
+        "crimp interchange": "crimp_interchange" in names,
+        "crimped contact": scene.contact_force == "crimped",
     }
     return {name for name, value in holds.items() if value}

@@ -10,7 +10,7 @@ import numpy as np
 from ..device.model import Model
 from ..errors import InputError, NoAttributeError, finite_array
 from .alone import alone
-from .inspection import Inspection
+from .placing import Placing
 from .reactions import Steps, reactions, work
 from .relaxation import Relaxation, Relaxed
 from .state import Trajectory
@@ -19,7 +19,7 @@ FIXED = ("scene", "step_size", "step_error", "chunk")
 """Attributes that a simulator has taken into its arrays when it was made."""
 
 
-class Loads(Inspection):
+class Loads(Placing):
     """Reads what holds the cloth and moves it. A base of the simulator."""
 
     def __setattr__(self, name: str, value: Any) -> None:
