@@ -39,7 +39,7 @@ FORBIDDEN = {
     f"{W}.envs": {K, f"{W}.device", f"{W}.integrators", f"{W}.calibration", f"{W}.io", f"{W}.view"},
 }  # fmt: skip
 """What no module of a room imports."""
-TERMS_BY_NAME = {f"{W}.description.scene"}
+TERMS_BY_NAME = {f"{W}.description.scene", f"{W}.description.selection"}
 """A scene looks up which terms there are; no other description knows kernels."""
 
 ONLY = {

@@ -156,7 +156,7 @@ def sizes(
 
 
 def warn_of_counts(fibre: Fibre, tex: float, twist: float, angle: float) -> None:
-    """Warns of a count or a twist that makes no sense."""
+    """Warns where a count or a twist makes no sense."""
     if tex < fibre.tex:
         text = f"tex = {tex:g} is less than one fibre of {fibre.tex:g} tex. tex is g/km, 1e-6 kg/m."
         warnings.warn(text, WarpYarnWarning, stacklevel=3)
