@@ -27,8 +27,10 @@ def momentum(cloth: wy.Cloth, state: wy.State) -> np.ndarray:
 
 def weight(cloth: wy.Cloth) -> np.ndarray:
     """Density times length of all segments, times gravity."""
-    density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material][cloth.topology.segment_yarn]
-    return density.sum() * cloth.spacing * GRAVITY
+    topology = cloth.topology
+    density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material][topology.segment_yarn]
+    a, b = topology.segment_nodes.T
+    return (density * np.abs(cloth.euler[b] - cloth.euler[a]).max(axis=1)).sum() * GRAVITY
 
 
 def moved(stiffness: float | None, *, sliding: bool = False, fabric=wy.paper.cloth, **options) -> wy.Scene:

@@ -14,9 +14,11 @@ FABRICS = wy.fabrics.FABRICS
 
 
 def weight(cloth: wy.Cloth) -> float:
-    """Of all segments [N]."""
-    density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material][cloth.topology.segment_yarn]
-    return float(density.sum() * cloth.spacing * 9.8)
+    """Of all segments, by their lengths of yarn [N]."""
+    topology = cloth.topology
+    density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material][topology.segment_yarn]
+    a, b = topology.segment_nodes.T
+    return float((density * np.abs(cloth.euler[b] - cloth.euler[a]).max(axis=1)).sum() * 9.8)
 
 
 def left(simulator: wy.Simulator) -> np.ndarray:
