@@ -275,3 +275,8 @@ def resolved_with_its_adjoint(
     made = Projected(rounds, start, inverse_mass, np.zeros(0), found - end, 1.0)
     to_start, to_end, _ = zones.taken_back(made, adjoint)
     return found, to_start, to_end, active
+
+
+def room_for_near(simulator: wy.Simulator) -> int:
+    """Places of each node in the list of what is near."""
+    return simulator.arrays["near_room"]

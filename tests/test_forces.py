@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 from cases import quick
+from internals import room_for_near
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
@@ -310,3 +311,141 @@ def test_no_pin_no_reaction():
     simulator = wy.Simulator(wy.Scene(wy.paper.cloth(rows=4, columns=4)))
     assert simulator.reactions(simulator.run(2)).shape == (2, 0, 3)
     assert simulator.work() == {}
+
+
+# -- cloths of several numbers, contact, single precision --------------------------------------------------------------
+
+
+def uneven(rows: int = 5, columns: int = 5, pose: str = "flat") -> wy.Cloth:
+    """Yarns of two sizes, unequal distances, crimp, and crossings by pairs of materials."""
+    yarns = [
+        wy.Yarn(density=4e-5, stretch=2e8, bend=1e-3, width=3e-4, thickness=1.5e-4),
+        wy.Yarn(density=2e-5, stretch=1e8, bend=2e-3, radius=1e-4),
+    ]
+    spacing = np.linspace(4e-4, 6e-4, rows - 1), np.linspace(7e-4, 4e-4, columns - 1)
+    return wy.Cloth(
+        wy.Weave.plain(rows=rows, columns=columns), yarns=yarns, warp=[0] * rows, weft=[1] * columns, spacing=spacing,
+        crimp=(0.05, 0.1), shear=[[1e3, 500.0], [800.0, 300.0]], friction=0.3, pose=pose,
+    )  # fmt: skip
+
+
+def lack(cloth: wy.Cloth, trajectory: wy.Trajectory, outer: np.ndarray) -> np.ndarray:
+    """What the change of momentum lacks of outer forces [steps, 3]."""
+    p = np.array([momentum(cloth, state) for state in map(trajectory.__getitem__, range(len(trajectory)))])
+    return np.diff(p, axis=0) / trajectory.step - outer
+
+
+@pytest.mark.parametrize("crimp", [{}, {"crimp_interchange": True}, {"contact_force": "crimped"}], ids=str)
+@pytest.mark.parametrize("method", quick(METHODS[:3], "sdirk2"))
+def test_uneven_cloths_close_the_balance_too(method, crimp):
+    scene = moved(None, fabric=uneven, gravity=np.repeat([[0.0, 0.0, -9.8], [1.0, 2.0, -5.0]], 4, axis=0), **crimp)
+    simulator = wy.Simulator(scene, integrator=method, **EXACT)
+    trajectory = simulator.run(6)
+    found = simulator.reactions(trajectory).sum(axis=1)
+    outer = weight(scene.cloth)[2] / GRAVITY[2] * scene.gravity[:6] + found
+    # as of a plain one
+    assert np.abs(lack(scene.cloth, trajectory, outer)).max() < 1e-11
+    assert np.abs(found).max() > 1e-5
+    bound = 1e-10 * np.abs(found).max()
+    np.testing.assert_allclose(simulator.reactions(), simulator.reactions(trajectory)[-1], atol=bound)
+
+
+@pytest.mark.parametrize("fabric", [wy.fabrics.handkerchief, uneven], ids=["plain", "uneven"])
+def test_what_touches_is_in_the_balance(fabric):
+    """A pinned cloth on the ground and another on it: obstacles give to the cloths, and these to each other."""
+    cloth = fabric(rows=5, columns=5, pose="flat")
+    apart = max(1.5 * cloth.longest_spacing, 3.0 * cloth.half_thickness)
+    other = cloth.replace(pose=cloth.position + np.array([0.0, 0.0, 1.2 * apart]))
+    ground = wy.Plane(point=(0, 0, -1.5 * cloth.half_thickness), normal=(0, 0, 1), friction=0.5)
+    scene = wy.Scene(
+        [cloth, other], obstacles=[ground], self_contact=True, sliding=False, pins=[0, 4], pin_stiffness=None,
+        gravity=(3.0, 0.0, -40.0),
+    )  # fmt: skip
+    # its one stage ends where the step does, so the forces there are those of the step
+    simulator = wy.Simulator(scene, integrator="implicit-euler", **EXACT)
+    rest, touching = [], []
+    for _ in range(12):
+        trajectory = simulator.run(1)
+        given = simulator.forces()
+        touching.append(np.abs(given["self_contact"][0]).max())
+        outer = 2.0 * weight(cloth)[2] / GRAVITY[2] * scene.gravity + simulator.reactions().sum(axis=0)
+        rest.append(lack(scene.cloth, trajectory, outer + given["obstacles"][0].sum(axis=0)))
+    # rounding of 1e-2 N, over fifty nodes
+    assert np.abs(rest).max() < 1e-13
+    assert np.abs(simulator.reactions().sum(axis=0)).max() > 1e-3 and max(touching) > 1e-6
+
+
+def test_reactions_in_single_precision_are_near_or_say_so():
+    found = {}
+    for precision in ("double", "single"):
+        simulator = wy.Simulator(moved(None, fabric=wy.paper.cloth), precision=precision)
+        found[precision] = simulator.reactions(simulator.run(6))
+    # of 8e-3 N, of which rounding makes 1e-5 N in positions and as much in the solve
+    np.testing.assert_allclose(found["single"], found["double"], atol=5e-3 * np.abs(found["double"]).max())
+    simulator = wy.Simulator(wy.Scene(uneven(), pins=[0], pin_stiffness=None), precision="single")
+    simulator.run(2)
+    with pytest.warns(wy.WarpYarnWarning, match=r"single precision are rounded .* precision='double'"):
+        simulator.reactions()
+
+
+@pytest.mark.parametrize("ask", ["reactions", "forces", "energy", "system"])
+def test_what_is_near_has_room_in_frames_that_no_step_came_to(ask, monkeypatch):
+    """A simulator whose cloths were apart is asked of frames where they touch."""
+    monkeypatch.setattr("warp_yarn.device.contact.NEAR_ROOM", 1)
+    cloth = wy.fabrics.handkerchief(rows=4, columns=4, pose="flat")
+    apart = max(1.5 * cloth.spacing, 3.0 * cloth.radius)
+    other = cloth.replace(pose=cloth.position + np.array([0.0, 0.0, 3.0 * apart]))
+    scene = wy.Scene([cloth, other], self_contact=True, gravity=None, pins=[0], pin_stiffness=None)
+    # with no step in parts, of which the other one would not know
+    first = wy.Simulator(scene, integrator="implicit-euler")
+    state = first.state
+    state.position[16:, 2] -= 1.5 * apart
+    first.state = state
+    trajectory = first.run(1)
+    assert not first.split_steps
+    other_one = wy.Simulator(scene, integrator="implicit-euler")
+    room = room_for_near(other_one)
+    of = trajectory if ask == "reactions" else trajectory[-1]
+    here, there = (getattr(simulator, ask)(of) for simulator in (first, other_one))
+    assert room_for_near(other_one) > room
+    other_one.run(1)
+    if ask == "reactions":
+        assert np.abs(here).max() > 0.0
+        np.testing.assert_allclose(there, here, rtol=1e-9)
+    elif ask == "forces":
+        assert np.abs(here["self_contact"][0]).max() > 0.0
+        # sums over pairs in another order
+        np.testing.assert_allclose(there["self_contact"][0], here["self_contact"][0], rtol=1e-9, atol=1e-15)
+    elif ask == "energy":
+        assert here["contact"] > 0.0 and there["contact"] == pytest.approx(here["contact"], rel=1e-12)
+    else:
+        np.testing.assert_allclose(there.rhs, here.rhs, rtol=1e-9, atol=1e-18)
+
+
+def test_a_step_of_other_inputs_is_not_looked_into():
+    """What the last step had is not in place any more."""
+    cloth = wy.paper.cloth(rows=4, columns=4)
+    ground = wy.Plane(point=(0, 0, -1.0), normal=(0, 0, 1))
+    scene = wy.Scene(cloth, pins=cloth.corners("bottom"), pin_stiffness=None, obstacles=[ground])
+    simulator = wy.Simulator(scene)
+    for change in (
+        lambda: simulator.set_inputs(gravity=(0.0, 0.0, -1.0)),
+        lambda: simulator.place_obstacles([[0.0, 0.0, -1.2 * cloth.radius]]),
+    ):
+        simulator.run(1)
+        before = simulator.reactions()
+        change()
+        for ask in (simulator.reactions, simulator.work):
+            with pytest.raises(wy.InputError, match=r"no step was made since .* an input that the last one had"):
+                ask()
+        simulator.run(1)
+        assert np.abs(simulator.reactions() - before).max() > 0.0
+    with pytest.raises(wy.InputError):
+        simulator.place_obstacles([[0.0, 0.0, 0.0]])
+    simulator.reactions()
+    # a row that no step has had is no change of it
+    simulator = wy.Simulator(scene.replace(gravity=np.tile(GRAVITY, (5, 1))))
+    simulator.run(2)
+    before = simulator.reactions()
+    simulator.set_inputs(gravity=(0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(simulator.reactions(), before)

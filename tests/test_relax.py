@@ -234,3 +234,69 @@ def test_one_long_step_has_the_gradient_of_the_equilibrium():
     (end * torch.tensor(direction)).sum().backward()
     # differences of ±0.1 % leave 1e-6 of curvature, and what 10 s leave of inertia
     assert stretch.grad.item() == pytest.approx(wanted, rel=1e-4)
+
+
+# -- contact of cloths, cloths of several numbers, single precision ----------------------------------------------------
+
+
+def stacked(fabric, precision: str = "double", **options) -> wy.Simulator:
+    """Two cloths above the ground, one above the other."""
+    cloth = fabric(rows=5, columns=5, pose="flat")
+    apart = 1.3 * max(1.5 * cloth.longest_spacing, 3.0 * cloth.half_thickness)
+    upper = cloth.replace(pose=cloth.position + np.array([0.0, 0.0, apart]))
+    ground = wy.Plane(point=(0, 0, -1.5 * cloth.half_thickness), normal=(0, 0, 1))
+    scene = wy.Scene([cloth, upper], obstacles=[ground], self_contact=True, **options)
+    return wy.Simulator(scene, precision=precision)
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize("fabric", [wy.fabrics.handkerchief, wy.fabrics.glass_7628], ids=["plain", "general"])
+def test_cloths_that_lie_on_each_other_come_to_rest(fabric, precision):
+    simulator = stacked(fabric, precision, sliding=False)
+    cloth = simulator.scene.cloth
+    node = weight(cloth) / cloth.nodes
+    if precision == "single":
+        with pytest.raises(wy.InputError, match=r"residual = None, must be given here: .* precision='double'"):
+            simulator.relax()
+        if cloth.general:  # rounding of its stiff yarns' stretch is more than it weighs
+            return
+    found = simulator.relax(residual=None if precision == "double" else 1e-6)
+    forces = simulator.forces()
+    of_upper = forces["self_contact"][0][25:, 2].sum()
+    off = 25.0 * found.residual if precision == "double" else 0.1 * weight(cloth)
+    assert of_upper == pytest.approx(0.5 * weight(cloth), abs=off)
+    assert forces["obstacles"][0][:, 2].sum() == pytest.approx(weight(cloth), abs=2.0 * off)
+    if precision == "double":
+        assert found.residual <= 1.01e-3 * node
+        before = simulator.state.position
+        simulator.run(5)
+        assert np.abs(simulator.state.position - before).max() < 2e-6
+
+
+def test_rounding_is_told_of():
+    """In single precision sliding stops short of what is asked for."""
+    cloth = wy.paper.cloth(rows=6, columns=6, pose="flat")
+    scene = wy.Scene(cloth, pins=cloth.corners("all"), pin_stiffness=None)
+    simulator = wy.Simulator(scene, precision="single")
+    with pytest.raises(wy.SimulationError, match=r"\(most\); rounding alone may leave .* N"):
+        simulator.relax(most=20)
+
+
+def test_obstacles_that_are_placed_elsewhere_press():
+    """A sheet on its corners, and a ball that is set into it: what it presses with is what pins take more."""
+    cloth = wy.fabrics.handkerchief(rows=7, columns=7, pose="flat")
+    middle = cloth.position.mean(axis=0)
+    ball = wy.Sphere(center=middle + np.array([0.0, 0.0, 9e-3]), radius=3e-3, friction=0.0)
+    scene = wy.Scene(cloth, pins=cloth.corners("all"), pin_stiffness=None, obstacles=[ball], sliding=False)
+    simulator = wy.Simulator(scene)
+    simulator.relax()
+    presses = []
+    for _ in range(3):
+        # its barrier begins 2 R above the cloth, which it presses down each time
+        above = simulator.state.position[24] + np.array([0.0, 0.0, 3e-3 + 1.3 * cloth.radius])
+        simulator.place_obstacles([above])
+        found = simulator.relax()
+        push = simulator.forces()["obstacles"][0][:, 2].sum()
+        assert found.reactions[:, 2].sum() == pytest.approx(weight(cloth) - push, abs=49 * found.residual)
+        presses.append(-push)
+    assert 0.0 < presses[0] < presses[1] < presses[2]

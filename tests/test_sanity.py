@@ -73,10 +73,55 @@ def test_a_warning_names_the_line_that_made_it():
     assert caught[0].filename == __file__
 
 
+TAPE = {"density": 2e-4, "stretch": 1e7, "bend": 1e-3}
+
+
+def uneven(gap: float = 1e-3, crimp: float = 0.1, **size: float) -> wy.Cloth:
+    """A cloth of unequal distances, of a yarn with a size of its own and one without."""
+    yarns = [wy.Yarn(**TAPE), wy.Yarn(**TAPE, **size)]
+    spacing = [1e-3, gap, 1e-3], 2e-3
+    return wy.Cloth(wy.Weave.plain(rows=4, columns=5), yarns=yarns, spacing=spacing, radius=2e-4, crimp=(0.0, crimp))
+
+
+WRONG_UNEVEN = {
+    "a gap in mm": ({"gap": 1.0}, r"^spacing = 1 m, usual"),
+    "a gap in km": ({"gap": 1e-6, "radius": 1e-7}, None),
+    "a yarn's radius": ({"radius": 5e-7}, r"^radius = 5e-07 m, usual is 1e-06 to 0.02 m"),
+    "a yarn's width": ({"width": 1e-3, "thickness": 1e-6}, r"^thickness = 1e-06 m, usual is 2e-06 to 0.04 m"),
+    "crimp in %": ({"crimp": 8.0}, r"^crimp = 8, usual is at most 0.6: it has to be a part of the distance"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_UNEVEN)
+def test_one_number_of_several_is_warned_of(name):
+    given, message = WRONG_UNEVEN[name]
+    if message is None:  # yarns of the cloth's own radius would overlap there
+        with pytest.raises(wy.InputError, match="overlap"):
+            uneven(**given)
+        return
+    with pytest.warns(wy.WarpYarnWarning, match=message) as caught:
+        uneven(**given)
+    assert len(caught) == 1 and caught[0].filename == __file__
+
+
+@pytest.mark.filterwarnings("error")
+def test_uneven_cloths_raise_no_alarm():
+    uneven()
+    uneven(width=8e-4, thickness=1e-4)
+    wy.Scene([uneven(), uneven(radius=1e-4).replace(pose=uneven().position + 1.0)])
+
+
+def test_counts_of_yarns_are_warned_of_alike():
+    with pytest.warns(wy.WarpYarnWarning, match="tex is g/km"):
+        wy.Yarn.from_tex(3e4)
+
+
 PLANE = {"point": (0, 0, 0), "normal": (0, 0, 1)}
 THINGS = {
     "weave": (lambda: wy.Weave.plain(rows=4, columns=4), "name", "other"),
     "yarn": (lambda: wy.paper.YARNS[1], "stretch", 1.0),
+    "fibre": (lambda: wy.FIBRES["cotton"], "tex", 0.2),
+    "draft": (lambda: wy.Draft(threading=[[1], [2]], treadling=[[1], [2]]), "name", "other"),
     "cloth": (lambda: wy.paper.cloth(rows=4, columns=4), "radius", 4e-4),
     "wind": (lambda: wy.Wind(velocity=(0, 1, 0)), "velocity", (0.0, 2.0, 0.0)),
     "contact": (wy.Contact, "friction", 0.1),

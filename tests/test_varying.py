@@ -479,3 +479,81 @@ def test_gradients_of_rows(method):
             # positions of 3e-3 m are rounded by 1e-18 m, times 1e6 and 300 numbers over 2e-3; and curvature of wind
             assert each.grad[entry].item() == pytest.approx(wanted, rel=1e-5, abs=1e-5 * float(each.grad.abs().max()))
     assert all(bool((value.grad.abs() > 0.0).all()) for value in inputs)
+
+
+# -- with contact, cloths of several numbers, single precision ---------------------------------------------------------
+
+
+@wp.func
+def gusts_of_doubles(position: wp.vec3d, time: wp.float64):
+    return wp.vec3d(wp.float64(0.0), wp.sin(wp.float64(200.0) * position[0] + time), wp.float64(0.0))
+
+
+@wp.func
+def gusts_of_singles(position: wp.vec3f, time: wp.float32):
+    return wp.vec3f(0.0, wp.sin(200.0 * position[0] + time), 0.0)
+
+
+def gusts_of_arrays(position: np.ndarray, time: float) -> np.ndarray:
+    return np.sin(200.0 * position[:, :1] + time) * [0.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_gusts_on_the_device_are_of_the_precision(precision):
+    functions = {"double": gusts_of_doubles, "single": gusts_of_singles}
+    cloth = wy.fabrics.glass_7628(rows=5, columns=5)
+    ends = []
+    for function in (gusts_of_arrays, functions.pop(precision)):
+        scene = wy.Scene(cloth, pins=cloth.corners("top"), wind=wy.Wind(velocity=function))
+        simulator = wy.Simulator(scene, precision=precision)
+        simulator.run(5)
+        ends.append(simulator.state.position)
+    # of 1e-4 m that it falls: the solver's tolerances
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+    (other,) = functions.values()
+    wanted = "vec3d" if precision == "double" else "vec3f"
+    with pytest.raises(wy.InputError, match=rf"wp\.func that cannot be compiled, .*wp\.{wanted}.* in {precision} prec"):
+        wy.Simulator(scene.replace(wind=wy.Wind(velocity=other)), precision=precision)
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize("fabric", [wy.fabrics.handkerchief, wy.fabrics.glass_7628], ids=["plain", "general"])
+def test_ways_to_vary_agree_where_cloth_touches(fabric, precision):
+    """Rows, a function of the middle of each step, and a hook say the same of a cloth on the ground."""
+    cloth = fabric(rows=4, columns=5, pose="flat")
+    ground = wy.Plane(point=(0, 0, -1.5 * cloth.half_thickness), normal=(0, 0, 1))
+    upper = cloth.replace(pose=cloth.position + np.array([0.0, 0.0, 1.3 * max(1.5 * cloth.longest_spacing, 1e-3)]))
+    scene = wy.Scene([cloth, upper], obstacles=[ground], self_contact=True, gravity=(0.0, 0.0, 0.0))
+
+    def weight(time):
+        return np.array([0.0, 2.0, -9.8]) * (1.0 + 500.0 * time)
+
+    rows = np.array([weight((k + 0.5) * 1e-3) for k in range(10)])
+    ways = {
+        "rows": ({"gravity": rows}, None),
+        "function": ({"gravity": weight}, None),
+        "hook": ({}, lambda simulator: simulator.set_inputs(gravity=weight((simulator.steps_done + 0.5) * 1e-3))),
+    }
+    ends = {}
+    for name, (changes, hook) in ways.items():
+        simulator = wy.Simulator(scene.replace(**changes), hook=hook, precision=precision)
+        simulator.run(10)
+        assert np.abs(simulator.forces()["obstacles"][0]).max() > 0.0
+        ends[name] = simulator.state.position
+    for name in ("function", "hook"):
+        np.testing.assert_allclose(ends[name], ends["rows"], rtol=0.0, atol=1e-12 if precision == "double" else 1e-8)
+
+
+def test_a_hook_may_place_obstacles():
+    """A ground that it lifts carries the cloth along."""
+    cloth = wy.fabrics.handkerchief(rows=4, columns=4, pose="flat")
+    start = -2.0 * cloth.radius
+    ground = wy.Plane(point=(0, 0, start), normal=(0, 0, 1))
+
+    def lift(simulator: wy.Simulator) -> None:
+        simulator.place_obstacles([[0.0, 0.0, start + 1e-5 * simulator.steps_done]])
+
+    simulator = wy.Simulator(wy.Scene(cloth, obstacles=[ground]), hook=lift)
+    simulator.run(40)
+    height = simulator.state.position[:, 2] - (start + 1e-5 * 39)
+    assert height.min() > cloth.radius and height.max() < 3.0 * cloth.radius

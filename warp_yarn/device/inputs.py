@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from ..description.varying import evaluated, kind_of
 from ..errors import InputError
@@ -37,7 +38,7 @@ class Inputs:
         self._gusts = None
         on_device = "gusts" in a.conditions and kind_of("wind velocity", self.functions["wind"]) == "device"
         if on_device and not a.variant.reverse:
-            self._gusts = gusts.define(a.variant, self.functions.pop("wind"))
+            self._gusts = self._compiled(self.functions.pop("wind"))
         self.hooked = hooked
         """Whether a hook may set them before each step."""
         if self.hooked and a.variant.reverse:
@@ -45,6 +46,23 @@ class Inputs:
         if self.functions and a.variant.reverse:
             what = ", ".join(map(str, self.functions))
             raise InputError(f"{what}: functions have no gradient, must be numbers or rows [steps, 3] here")
+
+    def _compiled(self, function: Any) -> wp.Kernel:
+        """Makes the kernel of gusts, and compiles it where a function of other types can be told from other faults."""
+        a = self.model.arrays
+        try:
+            kernel = gusts.define(a.variant, function)
+            kernel.module.load(a.device)
+        except (OSError, InputError):
+            raise
+        except Exception as error:
+            of = {"double": ("wp.vec3d", "wp.float64"), "single": ("wp.vec3f", "wp.float32")}
+            vector, scalar = of[self.model.precision]
+            raise InputError(
+                f"wind velocity is a wp.func that cannot be compiled, must be of (position: {vector}, time: {scalar}) "
+                f"and return a {vector} in {self.model.precision} precision: {error}"
+            ) from error
+        return kernel
 
     def evaluate(self, step: int, position: np.ndarray) -> None:
         """Puts what functions say in the step after so many others in place, of positions at its beginning."""
@@ -59,7 +77,7 @@ class Inputs:
             elif isinstance(name, int):
                 self.put("applied_force", evaluated(f"forces[{name}]", function, time, position), node=name)
 
-    def put(self, name: str, value: np.ndarray, *, first: int = 0, node: int | None = None) -> None:
+    def put(self, name: str, value: np.ndarray, *, first: int = 0, node: int | None = None) -> bool:
         """Puts an input in place, in its rows from one on where it has any.
 
         Args:
@@ -67,6 +85,9 @@ class Inputs:
             value: [entries, 3], or 3 numbers of one entry.
             first: the row.
             node: whose applied force it is; None: of all that there are.
+
+        Returns:
+            Whether steps before that row had what was put in place.
         """
         a = self.model.arrays
         array = a[f"{name}_path" if f"{name}_path" in a else name]
@@ -74,6 +95,7 @@ class Inputs:
         entry = slice(None) if node is None else int(np.flatnonzero(self.model.scene.force_nodes == node)[0])
         values[min(first, len(values) - 1) :, entry] = value
         array.assign(values.reshape(-1, 3))
+        return first >= len(values)
 
     def load(self, stage: int = 0) -> None:
         """Puts pins, obstacles and applied forces of a stage of this step in place, where they change."""

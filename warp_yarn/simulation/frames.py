@@ -54,6 +54,8 @@ class Frames:
         self.recording: Recording | None = None
         self.filled = 0
         """Steps of the chunk on the device that lead to the present state."""
+        self.inputs_changed = False
+        """Whether the last step was made with other inputs than those that are in place."""
 
     def moves(self, name: str) -> bool:
         """Tells whether this part of the state changes in the scene."""
@@ -116,7 +118,7 @@ class Frames:
 
     def last_step(self) -> list[State] | None:
         """Copies the states before and after the last step; None where none led to the present state."""
-        if not self.filled:
+        if not self.filled or self.inputs_changed:
             return None
         ends = [self.state(), self.state()]
         for name in FIELDS:
@@ -140,7 +142,7 @@ class Frames:
 
     def keep(self, start: int, made: int) -> None:
         """Keeps the frames of a chunk that began after so many steps, if a run asks for them."""
-        self.filled = made
+        self.filled, self.inputs_changed = made, False
         recording = self.recording
         if recording is not None and recording.open and start == recording.last:
             at = start - recording.first

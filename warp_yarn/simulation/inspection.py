@@ -198,6 +198,19 @@ class Inspection:
             return read_system(self.model)
 
 
+def make_room_where_crowded(stepper: Stepper) -> bool:
+    """Makes room for all that is near at the present positions, which no step may have come to; tells whether it had
+    to."""
+    contact, made = stepper.model.contact, False
+    if contact.self_contact or contact.has_mesh:
+        contact.find()
+        while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
+            stepper.make_room()
+            contact.find()
+            made = True
+    return made
+
+
 class Visit:
     """Another state for as long as a block lasts; the arrays that a step works with are free for it.
 
@@ -246,6 +259,7 @@ class Visit:
             model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
+        make_room_where_crowded(stepper)
 
     def __exit__(self, *_: object) -> None:
         self.stepper.pay()

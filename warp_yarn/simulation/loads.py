@@ -45,7 +45,8 @@ class Loads(Placing):
             are moved give way by over 1 % of their way.
 
         Raises:
-            InputError: no step was made since the state was set; frames of another cloth or step; impact zones, which
+            InputError: no step was made since the state was set, or what it had by ``set_inputs`` or
+                ``place_obstacles``; frames of another cloth or step; impact zones, which
                 have no forces; a registered integrator that is no StageMethod.
         """
         steps = Steps(self.stepper, trajectory)
@@ -87,10 +88,11 @@ class Loads(Placing):
         """
         checked = checked_inputs(self.model, self.stepper.steps_done, gravity=gravity, wind=wind, pins=pins)
         of_nodes = checked_forces(self.model, forces)
+        first, frames = self.stepper.steps_done, self.stepper.frames
         for name, value in checked.items():
-            self.model.inputs.put(name, value, first=self.stepper.steps_done)
+            frames.inputs_changed |= self.model.inputs.put(name, value, first=first)
         for node, force in of_nodes.items():
-            self.model.inputs.put("applied_force", force, first=self.stepper.steps_done, node=node)
+            frames.inputs_changed |= self.model.inputs.put("applied_force", force, first=first, node=node)
         if not self.model.inputs.hooked:
             # another height or place is no gain of energy; where a hook sets them, the watch counts their work
             self.stepper.owe(self.model.energy.forget)

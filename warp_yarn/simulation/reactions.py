@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..device.declarations import FRAMES
+from ..device.model import Model
 from ..errors import InputError, WarpYarnWarning
 from ..integrators.made import Made, Point
-from .inspection import Visit
+from .inspection import Visit, make_room_where_crowded
 from .state import State, Trajectory
 from .stepper import LEDGER, Stepper
 
@@ -24,6 +25,10 @@ GIVES_WAY = 0.01
 """Of the way that a pin was moved: from where on a spring that falls short by so much turns what a test reads."""
 REMADE = 1e-4
 """Of the cloth's size: how far a step in parts that is made again may end from where it did."""
+
+
+EPSILON = {"double": 1e-15, "single": 1e-7}
+"""Of positions: their rounding, with room in double precision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +73,10 @@ class Steps:
         if trajectory is None:
             last = stepper.frames.last_step()
             if last is None:
-                raise InputError("no step was made since the state was set: run one, or give a trajectory")
+                raise InputError(
+                    "no step was made since the state was set, or an input that the last one had: run one, or give a "
+                    "trajectory"
+                )
             self.frames: Any = last
             self.start = stepper.steps_done - 1
         else:
@@ -147,6 +155,7 @@ class Steps:
             if a[of_s] is not None and (of_s != "euler" or self.model.scene.sliding):
                 a[of_s].assign(values[:, 3:].ravel())
         self.model.inputs.load(stage)
+        make_room_where_crowded(self.stepper)
 
 
 def _point(state: State) -> Point:
@@ -210,9 +219,31 @@ def reactions(steps: Steps) -> np.ndarray:
             else:
                 part.method.assemble_made(stage)
                 result[k] -= share * a["rhs"].numpy()[scene.pins] / made.size
+    _warn_where_rounded(model, result)
     if springs:
         _warn_where_springs_give_way(steps, result)
     return result
+
+
+def rounding_force(model: Model) -> float:
+    """Estimates what rounding of positions makes of stretch's force on a node [N]."""
+    cloth = model.scene.cloth
+    extent = np.abs(cloth.position - model.arrays.origin).max()
+    a, b = cloth.topology.segment_nodes.T
+    shortest = np.abs(cloth.euler[b] - cloth.euler[a]).max(axis=1).min()
+    return float(EPSILON[model.precision] * extent * cloth.stretch_stiffness.max() / shortest)
+
+
+def _warn_where_rounded(model: Model, forces: np.ndarray) -> None:
+    """Warns where rounding in single precision is much of what pins give."""
+    off, most = rounding_force(model), float(np.nanmax(np.abs(forces), initial=0.0))
+    if model.precision == "single" and 0.0 < most < off / GIVES_WAY:
+        warnings.warn(
+            f"reactions of at most {most:.2g} N: positions in single precision are rounded by what makes some "
+            f"{off:.2g} N of a node's forces; precision='double' knows them",
+            WarpYarnWarning,
+            stacklevel=5,
+        )
 
 
 def _warn_where_springs_give_way(steps: Steps, forces: np.ndarray) -> None:
@@ -246,8 +277,10 @@ def work(steps: Steps) -> dict[str, np.ndarray]:
         for part, _, made in steps.stages(k, parts, ends=True):
             for name in names:
                 result[name][k] += part.size * h * made.share * model.energy.power_of(name)
-    if len(model.scene.pins):
+    if model.scene.pin_path is not None:
         result["pins"] = np.einsum("kpi,kpi->k", reactions(steps), _pin_motion(steps))
+    elif len(model.scene.pins):
+        result["pins"] = np.zeros(len(steps))
     return result
 
 
@@ -263,9 +296,7 @@ def _pin_motion(steps: Steps) -> np.ndarray:
     """Finds how far pins go in each step [steps, pins, 3] (m)."""
     scene, a = steps.model.scene, steps.model.arrays
     result = np.zeros((len(steps), len(scene.pins), 3))
-    if scene.pin_path is None:
-        return result
-    path = a["pin_target_path"].numpy().reshape(scene.pin_path.shape)
+    path = a["pin_target_path"].numpy().reshape(-1, *result.shape[1:])
     places = np.concatenate([a["pin_start"].numpy()[None], path])
     for k in range(len(steps)):
         row = steps.start + k

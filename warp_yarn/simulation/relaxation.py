@@ -17,6 +17,8 @@ from ..errors import InputError, SimulationError, integer, real
 from ..integrators.implicit_euler import ImplicitEuler
 from ..integrators.made import held
 from ..kernels.core.status import CROWDED
+from .inspection import make_room_where_crowded
+from .reactions import rounding_force
 from .state import FIELDS, State
 from .stepper import Stepper
 
@@ -30,8 +32,6 @@ ROUGH = 0.1
 """Of it: what rounding may leave at most where nothing is said."""
 GONE = 10.0
 """Times the size of the cloth: how far it may move as a whole before nothing holds it."""
-EPSILON = {"double": 1e-15, "single": 1e-7}
-"""Of positions: their rounding, with room in double precision."""
 
 
 class Relaxed(NamedTuple):
@@ -86,9 +86,9 @@ class Relaxation:
         # the energy that each step takes away with the velocity is none that was lost
         model.energy.on = False
         with ALONE:
-            method = ImplicitEuler(model)
+            self.method = ImplicitEuler(model)
         with model.threads.at_hand():
-            result = self._steps(method, start)
+            result = self._steps(self.method, start)
         found = self.frames.state()
         self.stepper.pay()
         self.stepper.begin_from(found)
@@ -133,7 +133,8 @@ class Relaxation:
             size = min(GROWTH * size, LONGEST * model.step_size)
             self._begin(method, size)
             forces = self._forces()
-        self._fail(self.most, left, "after as many steps as it may take (most)", state)
+        rounded = f"; rounding alone may leave {rounding_force(model):.2g} N" if model.precision == "single" else ""
+        self._fail(self.most, left, f"after as many steps as it may take (most){rounded}", state)
         raise AssertionError
 
     def _still(self, state: State) -> State:
@@ -158,6 +159,8 @@ class Relaxation:
         """Computes the forces on the cloth at rest, along x and (u, v) [nodes, 5] (N)."""
         a, nodes = self.arrays, self.model.scene.cloth.nodes
         self.model.inputs.load()
+        if make_room_where_crowded(self.stepper):
+            self.method.forget_graphs()
         self.model.assemble(matrix=False)
         result = np.zeros((nodes, 5))
         size = float(a["step_size"].numpy()[0])
@@ -195,11 +198,7 @@ class Relaxation:
 
 def _default(model: Model) -> float:
     """Gives the force to end with: a part of a node's weight, but what rounding of positions leaves at least."""
-    cloth = model.scene.cloth
-    extent = np.abs(cloth.position - model.arrays.origin).max()
-    a, b = cloth.topology.segment_nodes.T
-    shortest = np.abs(cloth.euler[b] - cloth.euler[a]).max(axis=1).min()
-    rounding = float(EPSILON[model.precision] * extent * cloth.stretch_stiffness.max() / shortest)
+    rounding = rounding_force(model)
     weight = 9.8 * model.arrays.node_mass()
     if rounding > ROUGH * weight:
         raise InputError(
