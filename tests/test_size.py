@@ -118,3 +118,10 @@ def test_others_are_none(docstring):
 def test_docstrings_of_functions_begin_with_a_verb():
     found = {name: without_verb(file.read_text()) for name, file in FILES.items()}
     assert not {name: functions for name, functions in found.items() if functions}
+
+
+def test_slow_tests_are_there():
+    """Names that no test has any more would hide that they are quick."""
+    for name in (ROOT / "tests" / "slow.txt").read_text().splitlines():
+        file, *_, function = name.split("[")[0].split("::")
+        assert re.search(rf"^ *def {function}\(", (ROOT / file).read_text(), flags=re.M), name
