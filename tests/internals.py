@@ -83,6 +83,12 @@ def near_faces(simulator: wy.Simulator) -> Near:
     return simulator.model.contact.near_faces()
 
 
+def near_pairs(simulator: wy.Simulator) -> Near:
+    """Every two samples that are near each other, with room for all of them."""
+    simulator.stepper.find_with_room()
+    return simulator.model.contact.near_pairs()
+
+
 def near_room(simulator: wy.Simulator) -> int:
     """Places of a node in the list of what is near."""
     return int(simulator.arrays["near_room"])

@@ -147,6 +147,29 @@ def test_self_contact(method: str, names: tuple[str, ...]) -> None:
     check_derivatives(rollout, names)
 
 
+MIDS = wy.Contact(samples="nodes+mids")
+
+
+@pytest.mark.parametrize(
+    ("method", "names"),
+    [
+        ("implicit-euler", ("self_contact_stiffness", "obstacle_friction", "velocity")),
+        *(pytest.param(m, (*ALL, "obstacle_friction"), marks=pytest.mark.slow) for m in METHODS),
+    ],
+)
+def test_middles_that_touch(method: str, names: tuple[str, ...]) -> None:
+    scene = wy.Scene(folded(), obstacles=[GROUND], self_contact=True, contact=MIDS)
+    check_derivatives(wt.Rollout(scene, STEPS // 2, integrator=method, **EXACT), names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_middles_on_obstacles(method: str) -> None:
+    """A mesh among them."""
+    names = (*OBSTACLE_LAW, "obstacle_size", "obstacle_position", "obstacle_rotation", *STATE, *FABRIC)
+    check_derivatives(wt.Rollout(drop().replace(contact=MIDS), STEPS, integrator=method, **EXACT), names)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_self_contact_of_locked_yarns(method: str) -> None:

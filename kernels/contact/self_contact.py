@@ -262,7 +262,7 @@ def define_limits(variant: Variant) -> SimpleNamespace:
 
 TERM = Term(
     name="self_contact",
-    elements="nodes",
+    elements="samples",
     define=define,
     energy=define_energy,
     parameters=(

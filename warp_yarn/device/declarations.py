@@ -3,8 +3,7 @@
 Arrays are made from these declarations (``arrays.py``), and no other name can be set or launched with. A test holds
 every argument of every kernel to them (``tests/kernels/test_declarations.py``). A group is what is made together.
 
-One **world** is one independent simulation of a batch. Today there is one; what steers it (status, step length,
-tolerances, counters) is an array over worlds all the same.
+One **world** is one independent simulation of a batch, today the only one: what steers it is an array over worlds.
 
 The field ``when`` names a condition of the scene (``fields.conditions``). Where it does not hold the name is None.
 """
@@ -177,32 +176,44 @@ CONTACT: Group = {
     "touching": Field("world", 3, "int", "", "always", "whether anything touches, two nodes, anything so fast"),
     "obstacle_velocity": Field("obstacle", 1, "vec3", "m/s", "obstacles", "ṗ"),
     "obstacle_spin": Field("obstacle", 1, "vec3", "rad/s", "obstacles", "ω"),
-    "face_room": Field("count", 1, "int", "", "always", "places of a node in the list of faces that are near"),
-    "face_count": Field("node", 1, "int", "", "obstacles", "how many of them are taken"),
+    "face_room": Field("count", 1, "int", "", "always", "places of a sample in the list of faces that are near"),
+    "face_count": Field("sample", 1, "int", "", "obstacles", "how many of them are taken"),
     "near_face": Field("near face", 1, "int", "", "obstacles", "faces that are near it, of all meshes"),
-    "near_room": Field("count", 1, "int", "", "always", "places of a node in the list of what is near"),
-    "near_count": Field("node", 1, "int", "", "self-contact", "how many of them are taken"),
-    "near": Field("near", 1, "int", "", "self-contact", "nodes that are near it"),
+    "near_room": Field("count", 1, "int", "", "always", "places of a sample in the list of what is near"),
+    "near_count": Field("sample", 1, "int", "", "self-contact", "how many of them are taken"),
+    "near": Field("near", 1, "int", "", "self-contact", "samples that are near it"),
     "near_block": Field("near", 1, "sym33", "kg", "self-contact", "matrix block of those that touch it, or 0"),
-    "near_position": Field("node", 1, "vec3", "m", "self-contact", "where nodes were when the list was made"),
+    "near_position": Field("sample", 1, "vec3", "m", "self-contact", "where they were when the list was made"),
     "outdated": Field("world", 1, "int", "", "self-contact", "whether it has to be made anew"),
+    "node_segments": Field("node", 4, "int", "", "middles", "segments at a node, or -1"),
+    "sample_is_free": Field("sample", 1, "int", "", "middles", "0 where any of its nodes is held, else 1"),
+    "sample_moves": Field("sample", 1, "int", "", "middles", "0 where all of its nodes are held, else 1"),
+    "sample_position": Field("sample", 1, "vec3", "m", "middles", "what samples have of the nodes' x"),
+    "sample_velocity": Field("sample", 1, "vec3", "m/s", "middles", "the same of ẋ"),
+    "sample_increment": Field("sample", 1, "vec3", "m/s", "middles", "the same of v₀ − w"),
+    "sample_direction": Field("sample", 1, "vec3", "m/s", "middles", "the same of δ"),
+    "sample_base_position": Field("sample", 1, "vec3", "m", "middles", "the same of q₀"),
+    "sample_solution": Field("sample", 1, "vec3", "m/s", "middles", "the same of w"),
+    "sample_force": Field("sample", 1, "vec3", "N", "middles", "on samples, to be scattered to nodes"),
+    "sample_block": Field("sample", 1, "mat33", "kg", "middles", "the same of the matrix"),
+    "taken_by": Field("node", 1, "int", "", "middles", "the obstacle that a node starts a stage beside, from 1, or 0"),
 }
 """What contact finds (``kernels/contact``)."""
 
 CONTACT_INPUTS: Group = {
-    "contact_stiffness": Field("world", 1, "scalar", "N/m", "obstacles", "κ of nodes on obstacles"),
+    "contact_stiffness": Field("world", 1, "scalar", "N/m", "obstacles", "κ of a sample on an obstacle"),
     "contact_distance": Field("world", 1, "scalar", "m", "obstacles", "D"),
     "contact_range": Field("world", 1, "scalar", "m", "obstacles", "d̂"),
     "contact_slip_speed": Field("world", 1, "scalar", "m/s", "obstacles", "ε"),
     "contact_damping_speed": Field("world", 1, "scalar", "m/s", "obstacles", "v_d"),
-    "self_contact_stiffness": Field("world", 1, "scalar", "N/m", "self-contact", "κ of nodes on nodes"),
+    "self_contact_stiffness": Field("world", 1, "scalar", "N/m", "self-contact", "κ of a sample on another"),
     "self_contact_distance": Field("world", 1, "scalar", "m", "self-contact", "D"),
     "self_contact_range": Field("world", 1, "scalar", "m", "self-contact", "d̂"),
     "self_contact_slip_speed": Field("world", 1, "scalar", "m/s", "self-contact", "ε"),
     "self_contact_damping_speed": Field("world", 1, "scalar", "m/s", "self-contact", "v_d"),
     "contact_friction": Field("world", 1, "scalar", "", "self-contact", "μ of cloth on cloth"),
     "near_margin": Field("world", 1, "scalar", "m", "self-contact", "beyond D + d̂ of the list of what is near"),
-    "rest_place": Field("node", 2, "scalar", "m", "self-contact", "(u, v) at rest, far apart on different cloths"),
+    "rest_place": Field("sample", 2, "scalar", "m", "self-contact", "(u, v) at rest, far apart on different cloths"),
     "obstacle_shape": Field("obstacle", 1, "int", "", "obstacles", "as contact/distances.py numbers them"),
     "obstacle_size": Field("obstacle", 1, "vec3", "m", "obstacles", "what a shape has for numbers"),
     "obstacle_friction": Field("obstacle", 1, "scalar", "", "obstacles", "μ"),
@@ -342,6 +353,7 @@ LAUNCH: Group = {
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),
     "share": Field("launch", 1, "scalar", "", "always", "of a stage in what a step makes"),
     "step_duration": Field("launch", 1, "scalar", "s", "always", "h of a whole step"),
+    "is_last": Field("launch", 1, "int", "", "always", "whether what is in the way is a failure"),
     "moves": Field("launch", 1, "int", "", "always", "whether to look at where a step would lead"),
     "grid": Field("launch", 1, "uint64", "", "always", "Warp's hash grid"),
     "gaps": Field("launch", 1, "vec4", "1, m", "always", "(n, g) of what is near"),

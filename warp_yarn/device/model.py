@@ -29,7 +29,9 @@ MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
 )  # fmt: skip
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
-BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
+BETWEEN = (
+    *SUMS, "friction_force_out", "normal", "contact_load", "sample_position", "sample_velocity", "sample_force",
+)  # fmt: skip
 """Arrays that an assembly passes through, whose adjoints start at 0."""
 
 
@@ -126,8 +128,15 @@ class Model:
         self.arrays.launch(self.kernels[kernel], elements, **replaced)
 
     def launch_term(self, term: Term, **offered: Any) -> None:
-        """Launch a term, with what its kernel has arguments for."""
+        """Launch a term, with what its kernel has arguments for. Forces of contact are still to be scattered."""
+        if term.touches:
+            offered |= self.contact.samples.offered(matrix=bool(offered.get("matrix")))
         self.launch(term.name, term.elements, **self.arrays.taken(self.kernels[term.name], **offered))
+
+    def launch_energy(self, term: Term, energy: wp.array) -> None:
+        """Add a term's energy."""
+        arrays = self.contact.samples.of("position") if term.touches else {}
+        self.launch(f"{term.name}_energy", term.elements, energy=energy, **arrays)
 
     def copy(self, **targets: str) -> None:
         """Copies arrays, target="source", those that the scene has; ``x_grad`` is the gradient of ``x``."""
@@ -156,19 +165,22 @@ class Model:
         a.zero(*SUMS)
         if matrix:
             a.zero(*MATRIX)
-        self._find_normals()
+        self._find_normals(matrix=matrix)
+        touching = [term for term in a.terms if term.touches]
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
             self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
+            if touching and term is touching[-1]:
+                self.contact.samples.scatter(matrix=matrix)
         self.launch("right_hand_side", "nodes", **replaced)
 
-    def _find_normals(self) -> None:
+    def _find_normals(self, *, matrix: bool = False) -> None:
         """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
         if self.arrays.contact:
             self.arrays.zero("contact_load")
             self.launch("contact_normal", "crossings")
-        self.contact.find()
+        self.contact.find(matrix=matrix)
 
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
