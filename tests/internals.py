@@ -18,6 +18,7 @@ from warp_yarn.device.contact import Near
 from warp_yarn.device.impact_zones import Projected
 from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
+from warp_yarn.simulation.inspection import find_with_room
 from warp_yarn.view import render
 
 # -- a simulator's arrays ---------------------------------------------------------------------------------------------
@@ -85,13 +86,20 @@ def near_faces(simulator: wy.Simulator) -> Near:
 
 def near_pairs(simulator: wy.Simulator) -> Near:
     """Every two samples that are near each other, with room for all of them."""
-    simulator.stepper.find_with_room()
+    find_with_room(simulator.stepper)
     return simulator.model.contact.near_pairs()
 
 
 def near_room(simulator: wy.Simulator) -> int:
     """Places of a node in the list of what is near."""
     return int(simulator.arrays["near_room"])
+
+
+def set_near_room(simulator: wy.Simulator, room: int) -> None:
+    """Leaves a sample so many places for what is near it."""
+    simulator.model.contact.make_room(room)
+    simulator.integrator.forget_graphs()
+    simulator.stepper.substepping.forget_graphs()
 
 
 def obstacles_begin_a_step(simulator: wy.Simulator) -> None:

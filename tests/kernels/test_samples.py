@@ -8,7 +8,20 @@ import torch
 from checks import check_definite, error
 from internals import launch_one_by_one, look_after_stages, near_obstacles, near_pairs, numbers, put, upload
 from reference import Tensor, tensor
-from touching import GROUND, SHAPES, TURNED, folded, law_of, lifted, middles, paper, parts_of, places_near, posed, shapes
+from touching import (
+    GROUND,
+    SHAPES,
+    TURNED,
+    folded,
+    law_of,
+    lifted,
+    middles,
+    paper,
+    parts_of,
+    places_near,
+    posed,
+    shapes,
+)
 
 import warp_yarn as wy
 
@@ -228,8 +241,11 @@ def crumpling(seed: int) -> wy.Scene:
 
 @pytest.mark.parametrize(
     ("method", "seed"),
-    [("implicit-euler", 0), *(pytest.param(m, s, marks=pytest.mark.slow) for m in ("implicit-euler", "sdirk2") for s in (1, 2))],
-)  # fmt: skip
+    [
+        ("implicit-euler", 0),
+        *(pytest.param(m, s, marks=pytest.mark.slow) for m in ("implicit-euler", "sdirk2") for s in (1, 2)),
+    ],
+)
 def test_nothing_penetrates(method: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """At any stage: neither obstacles, one of which is driven into the cloth, nor the cloth itself."""
     scene = crumpling(seed)

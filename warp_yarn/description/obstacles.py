@@ -255,7 +255,7 @@ class Contact(Fixed):
             third of that, of two samples of cloth a ninth: as many more touch.
         distance: D, how near samples may come to obstacles [m], above 0; None: the yarns' radius.
         range: d̂, beyond D, over which obstacles push [m], above 0; None: the yarns' radius.
-        self_distance: D of cloth on cloth, between samples [m], above 0; None: 1.5 spacings, or 3 radii if that is more.
+        self_distance: D of cloth on cloth, between samples [m], above 0; None: 1.5 spacings, or 3 radii if more.
         self_range: d̂ of cloth on cloth [m], above 0; None: the spacing.
         friction: μ of cloth on cloth, at least 0; None: 0.3 of a barrier. (Each obstacle has its own.)
         slip_speed: ε, at which friction reaches μ f_n [m/s], above 0: what sticks creeps, at ε (1 − √(1 − r)) under a

@@ -29,7 +29,7 @@ PLACED = ("obstacle_position", "obstacle_rotation", "obstacle_velocity", "obstac
 """Arrays that follow from the paths at the time of a stage."""
 SAMPLED = ("position", "velocity", "increment")
 """Arrays of nodes that contact reads."""
-NEAR_ROOM, FACE_ROOM = 32, 16
+NEAR_ROOM, FACE_ROOM = 8, 16
 """Samples and faces near each sample that there is room for at first."""
 SAMPLES_A_NODE = 3.0
 """With middles: a node has two segments, but at the border."""
@@ -156,6 +156,7 @@ class Contact:
         damps_impacts: whether a method that has a fallback leaves steps with an impact to it.
         has_mesh: whether any is a mesh.
         samples: what touches.
+        last: the last of its terms, or None.
     """
 
     damps_impacts = True
@@ -167,6 +168,7 @@ class Contact:
         self.on = self.obstacles or self.self_contact
         self.obstacles_move = "obstacles move" in model.arrays.conditions
         self.samples = Samples(model)
+        self.last = next((term for term in reversed(model.arrays.terms) if term.touches), None)
         self._tapes: dict[int, wp.Tape] = {}
         self.has_mesh = "meshes" in scene.terms
         if self.self_contact:
@@ -180,7 +182,7 @@ class Contact:
             self.make_room(NEAR_ROOM)
 
     def make_room(self, room: int | None = None) -> None:
-        """Make room for so many samples near each, or twice as many samples and faces as there is; the next look makes a
+        """Make room for so many samples near each, or for twice as many, and as many faces; the next look makes a
         list."""
         a = self.model.arrays
         if self.self_contact:

@@ -133,11 +133,6 @@ class Model:
             offered |= self.contact.samples.offered(matrix=bool(offered.get("matrix")))
         self.launch(term.name, term.elements, **self.arrays.taken(self.kernels[term.name], **offered))
 
-    def launch_energy(self, term: Term, energy: wp.array) -> None:
-        """Add a term's energy."""
-        arrays = self.contact.samples.of("position") if term.touches else {}
-        self.launch(f"{term.name}_energy", term.elements, energy=energy, **arrays)
-
     def copy(self, **targets: str) -> None:
         """Copies arrays, target="source", those that the scene has; ``x_grad`` is the gradient of ``x``."""
         for target, source in targets.items():
@@ -166,12 +161,11 @@ class Model:
         if matrix:
             a.zero(*MATRIX)
         self._find_normals(matrix=matrix)
-        touching = [term for term in a.terms if term.touches]
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
             self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
-            if touching and term is touching[-1]:
+            if term is self.contact.last:
                 self.contact.samples.scatter(matrix=matrix)
         self.launch("right_hand_side", "nodes", **replaced)
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..device.contact import Near
 from ..device.model import Model
 from ..errors import InputError
+from ..kernels.core.status import CROWDED
 from .alone import alone
 from .checks import checked_state
 from .contacts import Contacts, contacts_of
@@ -135,7 +136,8 @@ class Inspection:
         told = []
         for near in found:
             ends = contact.samples.ends
-            mine = (ends[near.sample] == node).any(axis=1) | ((near.other >= 0) & (ends[near.other] == node).any(axis=1))
+            its = (near.other >= 0) & (ends[near.other] == node).any(axis=1)
+            mine = (ends[near.sample] == node).any(axis=1) | its
             if mine.any():
                 gap, least, words = self._nearest(Near(*(values[mine] for values in near)))
                 told.append((gap - least, words))
@@ -167,7 +169,7 @@ class Inspection:
             for term in a.terms:
                 if term.energy is not None:
                     energy.zero_()
-                    self.model.launch_energy(term, energy)
+                    self.model.energy.add(term, energy)
                     # what touches is told as one
                     name = "contact" if term.touches else term.name
                     result[name] = result.get(name, 0.0) + float(energy.numpy()[0])
@@ -187,6 +189,14 @@ class Inspection:
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             self.model.assemble()
             return read_system(self.model)
+
+
+def find_with_room(stepper: Stepper) -> None:
+    """Looks for what touches at the present positions, and makes room until there is enough for it."""
+    stepper.model.contact.find()
+    while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
+        stepper.make_room()
+        stepper.model.contact.find()
 
 
 class _Visit:
@@ -218,7 +228,7 @@ class _Visit:
         model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
-        stepper.find_with_room()
+        find_with_room(stepper)
 
     def __exit__(self, *_: object) -> None:
         self.stepper.pay()

@@ -207,13 +207,6 @@ class Stepper:
         self.substepping.forget_graphs()
         self.arrays.put("status", 0, 0, 0)
 
-    def find_with_room(self) -> None:
-        """Looks for what touches at the present positions, and makes room until there is enough for it."""
-        self.model.contact.find()
-        while self._status() == CROWDED:
-            self.make_room()
-            self.model.contact.find()
-
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
         ledger = {name: self.arrays[name].numpy().copy() for name in LEDGER if name in self.arrays}
