@@ -81,9 +81,8 @@ class Model:
         self.tolerance = real("tolerance", tolerance, above=0.0)
         given = defaults.EXACT if newton_tolerance is None and exact else newton_tolerance
         self._newton_tolerance = given if given is None else real("newton_tolerance", given, above=0.0)
-        if max_iterations is None:
-            max_iterations = defaults.max_iterations(scene)
-        self.max_iterations = integer("max_iterations", max_iterations, least=1)
+        most = defaults.max_iterations(scene) if max_iterations is None else max_iterations
+        self.max_iterations = integer("max_iterations", most, least=1)
         self.device = _checked_device(device)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
         self.kernels = _kernels(scene, variant)
@@ -129,8 +128,7 @@ class Model:
 
     def launch_term(self, term: Term, **offered: Any) -> None:
         """Launch a term, with what its kernel has arguments for. Forces of contact are still to be scattered."""
-        if term.touches:
-            offered |= self.contact.samples.offered(matrix=bool(offered.get("matrix")))
+        offered |= self.contact.samples.offered(matrix=bool(offered.get("matrix"))) if term.touches else {}
         self.launch(term.name, term.elements, **self.arrays.taken(self.kernels[term.name], **offered))
 
     def copy(self, **targets: str) -> None:
@@ -180,10 +178,10 @@ class Model:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
         a = self.arrays
         self._find_normals()
-        for term in a.terms:
-            if a.contact and term.presses:
-                # the forces go where the solver works
-                unused = {"force": a["q_x"], "euler_force": a["q_s"]}
+        # the forces go where the solver works
+        unused = {"force": a["q_x"], "euler_force": a["q_s"]}
+        for term in a.terms if a.contact else ():
+            if term.presses:
                 self.launch_term(term, matrix=0, add_contact_load=1, **unused)
 
     def set_pin_velocity(self, **replaced: Any) -> None:
@@ -196,7 +194,7 @@ class Model:
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
-        if self.preconditioner == "multilevel":
+        elif self.preconditioner == "multilevel":
             _factorize_levels(self)
 
     def solve(self, **replaced: Any) -> None:
