@@ -72,9 +72,8 @@ class Model:
         self.scene = scene
         self.step_size = real("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
-        if preconditioner is None:
-            preconditioner = defaults.preconditioner(scene, self.step_size)
-        self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
+        chosen = defaults.preconditioner(scene, self.step_size) if preconditioner is None else preconditioner
+        self.preconditioner = choice("preconditioner", chosen, PRECONDITIONERS)
         exact = differentiable and precision == "double"
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
