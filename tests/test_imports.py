@@ -36,6 +36,7 @@ FORBIDDEN = {
     f"{W}.io": {f"{W}.simulation.simulator", f"{W}.device.model", f"{W}.integrators", f"{W}.gradients"},
     f"{W}.view": {f"{W}.simulation.simulator", f"{W}.device.model", f"{W}.integrators", f"{W}.gradients"},
     f"{W}.presets": {f"{W}.simulation", f"{W}.device", f"{W}.gradients", f"{W}.io"},
+    f"{W}.envs": {K, f"{W}.device", f"{W}.integrators", f"{W}.calibration", f"{W}.io", f"{W}.view"},
 }  # fmt: skip
 """What no module of a room imports."""
 TERMS_BY_NAME = {f"{W}.description.scene"}
@@ -43,9 +44,12 @@ TERMS_BY_NAME = {f"{W}.description.scene"}
 
 ONLY = {
     "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "parts", "rollout", "run")}
-    | {f"{W}.calibration.problem"},
+    | {f"{W}.calibration.problem", f"{W}.envs.gradient", f"{W}.envs.throw", f"{W}.envs.throws"},
+    "gymnasium": {f"{W}.envs", f"{W}.envs.throw"},
+    "stable_baselines3": set(),
     "pxr": {f"{W}.io.usd"},
     "h5py": {f"{W}.io.published"},
+    "dtx_to_wif": {f"{W}.io.draft"},
     "pyvista": set(),
     "scenes": set(),
     "benchmarks": set(),
@@ -149,7 +153,9 @@ def test_importing_the_package_loads_no_extra():
     loaded = set(done.stdout.split())
     assert {"warp", "warp_yarn", "numpy"} <= loaded
     extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
+    extras |= {"gymnasium", "stable_baselines3"}
     assert not loaded & extras
+    assert "dtx_to_wif" not in loaded
 
 
 # -- the tests --------------------------------------------------------------------------------------------------------

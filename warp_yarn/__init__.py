@@ -5,14 +5,17 @@ import importlib.metadata
 from types import ModuleType
 
 from . import moved
-from .description.cloth import Cloth, Yarn
+from .description.cloth import Cloth
 from .description.cloths import Cloths
+from .description.draft import Draft
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
+from .description.yarn import Yarn
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
+from .io.draft import read_draft, write_draft
 from .io.published import Published, read_published
 from .io.usd import write_usd
 from .kernels import Term, TermParameter, Variant
@@ -20,6 +23,7 @@ from .presets import fabrics, paper
 from .registration import register_integrator, register_term, unregister_integrator, unregister_term
 from .simulation.simulator import Simulator
 from .simulation.state import State, Trajectory
+from .view.drawdown import write_drawdown
 from .view.render import write_mp4, write_png
 
 moved.install()
@@ -34,6 +38,7 @@ __all__ = [
     "Cloths",
     "Contact",
     "Cylinder",
+    "Draft",
     "GradientError",
     "InputError",
     "Plane",
@@ -56,12 +61,15 @@ __all__ = [
     "__version__",
     "fabrics",
     "paper",
+    "read_draft",
     "read_published",
     "register_integrator",
     "register_term",
     "sdirk",
     "unregister_integrator",
     "unregister_term",
+    "write_draft",
+    "write_drawdown",
     "write_mp4",
     "write_png",
     "write_usd",

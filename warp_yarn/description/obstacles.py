@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, real
-from .cloth import Fixed
+from .fixed import Fixed
 
 ROUNDING = 1e-15
 """Of a length of 1: what was normalized stays as it is, to the last bit."""
@@ -253,10 +253,12 @@ class Contact(Fixed):
         method: "barrier" or "impact-zones".
         stiffness: κ of a contact [N/m], above 0; None: m (3 m/s / range)², m the mean mass of a node, and with mids a
             third of that, of two samples of cloth a ninth: as many more touch.
-        distance: D, how near samples may come to obstacles [m], above 0; None: the yarns' radius.
-        range: d̂, beyond D, over which obstacles push [m], above 0; None: the yarns' radius.
-        self_distance: D of cloth on cloth, between samples [m], above 0; None: 1.5 spacings, or 3 radii if more.
-        self_range: d̂ of cloth on cloth [m], above 0; None: the spacing.
+        distance: D, how near samples may come to obstacles [m], above 0; None: the yarns' radius, half
+            the thickness of the thickest.
+        range: d̂, beyond D, over which obstacles push [m], above 0; None: the same.
+        self_distance: D of cloth on cloth, between samples [m], above 0; None: 1.5 spacings, of the
+            longest, or 3 of those radii if that is more.
+        self_range: d̂ of cloth on cloth [m], above 0; None: that spacing.
         friction: μ of cloth on cloth, at least 0; None: 0.3 of a barrier. (Each obstacle has its own.)
         slip_speed: ε, at which friction reaches μ f_n [m/s], above 0: what sticks creeps, at ε (1 − √(1 − r)) under a
             share r of that.
