@@ -104,22 +104,22 @@ def twist(fabric: str) -> Staged:
 def needles(fabric: str) -> Staged:
     """On five times five needles, thinner than its mesh: middles touch as well."""
     cloth = sheet(fabric, 17, 17)
-    l = cloth.spacing
-    law = wy.Contact(samples="nodes+mids", distance=0.3 * l, range=0.3 * l)
-    foot = [(3.3 * l * i, 3.3 * l * j, 0.0) for i in range(-2, 3) for j in range(-2, 3)]
-    bed = [wy.Capsule(start=p, end=p + 4.0 * l * UP, radius=0.15 * l, friction=0.3) for p in map(np.array, foot)]
-    cloth = sheet(fabric, 17, 17, 5.0 * l)
+    mesh = cloth.spacing
+    law = wy.Contact(samples="nodes+mids", distance=0.3 * mesh, range=0.3 * mesh)
+    foot = [(3.3 * mesh * i, 3.3 * mesh * j, 0.0) for i in range(-2, 3) for j in range(-2, 3)]
+    bed = [wy.Capsule(start=p, end=p + 4.0 * mesh * UP, radius=0.15 * mesh, friction=0.3) for p in map(np.array, foot)]
+    cloth = sheet(fabric, 17, 17, 5.0 * mesh)
     return Staged(wy.Scene(cloth, obstacles=[floor(), *bed], self_contact=True, contact=law), 150)
 
 
 def funnel(fabric: str) -> Staged:
     """Pulled through a funnel by its middle."""
     cloth = sheet(fabric, 13, 13)
-    l, sides = cloth.spacing, 32
+    mesh, sides = cloth.spacing, 32
     angle = 2.0 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-    wide, narrow = 10.0 * l * ring, 3.2 * l * ring - 9.0 * l * UP
-    neck = 3.2 * l * ring - 16.0 * l * UP
+    wide, narrow = 10.0 * mesh * ring, 3.2 * mesh * ring - 9.0 * mesh * UP
+    neck = 3.2 * mesh * ring - 16.0 * mesh * UP
     vertices, k = np.concatenate([wide, narrow, neck]), np.arange(sides)
     after = (k + 1) % sides
     faces = []
@@ -128,10 +128,10 @@ def funnel(fabric: str) -> Staged:
         faces += [*zip(level + k, level + sides + after, level + sides + k, strict=True)]
     cone = wy.TriangleMesh(vertices, faces, friction=0.1)
     cloth = sheet(fabric, 13, 13, 0.0)
-    cloth = cloth.replace(pose=cloth.position + 0.5 * l * UP)
+    cloth = cloth.replace(pose=cloth.position + 0.5 * mesh * UP)
     middle = [cloth.node(6, 6)]
-    steps = 200
-    path = cloth.position[middle] - 30.0 * l * np.linspace(1.0 / steps, 1.0, steps)[:, None, None] * UP
+    steps = 130
+    path = cloth.position[middle] - 20.0 * mesh * np.linspace(1.0 / steps, 1.0, steps)[:, None, None] * UP
     scene = wy.Scene(cloth, obstacles=[cone], pins=middle, pin_path=path, self_contact=True)
     return Staged(scene, steps, driven=True, view=(0.5, -1.0, 0.9))
 
@@ -139,29 +139,27 @@ def funnel(fabric: str) -> Staged:
 def rollers(fabric: str) -> Staged:
     """Drawn in between two rollers."""
     cloth = sheet(fabric, 25, 9)
-    l, r = cloth.spacing, cloth.radius
-    radius, steps = 5.0 * l, 120
+    mesh, r = cloth.spacing, cloth.radius
+    radius, steps = 5.0 * mesh, 60
     t = H * np.arange(1, steps + 1)
     upright = np.stack([0.0 * cloth.position[:, 1], cloth.position[:, 0], cloth.position[:, 1]], axis=1)
-    cloth = cloth.replace(pose=upright + (10.0 * l) * UP)
+    cloth = cloth.replace(pose=upright + (10.0 * mesh) * UP)
     rolls = []
     for side in (-1.0, 1.0):
-        at = np.array([side * (radius + 1.45 * r), 0.0, 0.0])
+        at, half = np.array([side * (radius + 1.45 * r), 0.0, 0.0]), 7.0 * mesh * np.array([0.0, 1.0, 0.0])
         turns = Rotation.from_rotvec(side * -40.0 * t[:, None] * [0.0, 1.0, 0.0])
-        lies = Rotation.from_rotvec([-0.5 * np.pi, 0.0, 0.0])
-        roll = wy.Cylinder(start=at - [0.0, 7.0 * l, 0.0], end=at + [0.0, 7.0 * l, 0.0], radius=radius, friction=0.5)
+        roll = wy.Cylinder(start=at - half, end=at + half, radius=radius, friction=0.5)
         path = np.hstack([np.tile(at, (steps, 1)), (turns * Rotation.from_quat(roll.rotation)).as_quat()])
         rolls.append(roll.replace(path=path))
-        del lies
     return Staged(wy.Scene(cloth, obstacles=rolls, self_contact=True), steps, driven=True)
 
 
 def pulled(fabric: str, acceleration: float, speed: float, steps: int) -> Staged:
     """A table cloth from under another cloth, by its edge."""
     cloth = sheet(fabric, 17, 17)
-    l = cloth.spacing
+    mesh = cloth.spacing
     lower = sheet(fabric, 17, 17, 2.0 * cloth.radius * (1.0 + 1e-6))
-    upper = sheet(fabric, 9, 9, 2.0 * cloth.radius + 2.5 * l)
+    upper = sheet(fabric, 9, 9, 2.0 * cloth.radius + 2.5 * mesh)
     t, until = H * np.arange(1, steps + 1), speed / acceleration
     moved = np.where(t < until, 0.5 * acceleration * t**2, speed * (t - 0.5 * until))
     pins = [lower.node(16, column) for column in range(17)]
@@ -184,7 +182,7 @@ SCENES: dict[str, Callable[[str], Staged]] = {
 }
 
 
-# -- how near -----------------------------------------------------------------------------------------------------------
+# -- how near ---------------------------------------------------------------------------------------------------------
 
 
 class Gaps:
@@ -252,10 +250,10 @@ def to_triangles(x: np.ndarray, corners: np.ndarray) -> float:
     return min(best, float(np.where(inside, over, np.inf).min()))
 
 
-# -- runs ---------------------------------------------------------------------------------------------------------------
+# -- runs -------------------------------------------------------------------------------------------------------------
 
 
-def play(name: str, fabric: str, seed: int) -> tuple[dict[str, object], wy.Trajectory | None]:
+def play(name: str, fabric: str, seed: int) -> tuple[dict[str, object], wy.Trajectory]:
     """Plays a scene; where a step cannot be made the row says so, and there are the frames before it."""
     staged = SCENES[name](fabric)
     scene = staged.scene
@@ -264,8 +262,8 @@ def play(name: str, fabric: str, seed: int) -> tuple[dict[str, object], wy.Traje
         state, random = simulator.state, np.random.default_rng(seed)
         state.position[:] += 0.01 * scene.cloth.spacing * random.uniform(-1.0, 1.0, state.position.shape)
         simulator.state = state
-    gaps, near, iterations, energies, failed, frames = Gaps(scene), [], [], [], "", []
-    seconds = 0.0
+    gaps, near, iterations, energies, failed = Gaps(scene), [], [], [], ""
+    seconds, last = 0.0, simulator.chunk_trajectory(1)
     for step in range(staged.steps + 1):
         near.append(gaps.of(simulator.state.position, step))
         if not staged.driven:
@@ -273,7 +271,7 @@ def play(name: str, fabric: str, seed: int) -> tuple[dict[str, object], wy.Traje
         if step < staged.steps:
             begin = time.perf_counter()
             try:
-                frames.append(simulator.run(1))
+                last = simulator.run(1)
             except wy.SimulationError as error:
                 failed = str(error).partition(":")[0]
                 break
@@ -299,12 +297,8 @@ def play(name: str, fabric: str, seed: int) -> tuple[dict[str, object], wy.Traje
         "ms a step": 1e3 * seconds / len(iterations),
         "failed": failed or "no",
     }
-    return row, joined(simulator, frames)
-
-
-def joined(simulator: wy.Simulator, frames: Sequence[wy.Trajectory]) -> wy.Trajectory:
-    """The last frame, as a trajectory that knows how far obstacles have moved."""
-    return frames[-1]
+    # the last step, which knows how far obstacles have moved
+    return row, last
 
 
 def montage(pictures: dict[str, Path], path: Path) -> None:

@@ -2,9 +2,7 @@
 
 Arrays are made from these declarations (``arrays.py``), and no other name can be set or launched with. A test holds
 every argument of every kernel to them (``tests/kernels/test_declarations.py``). A group is what is made together.
-
 One **world** is one independent simulation of a batch, today the only one: what steers it is an array over worlds.
-
 The field ``when`` names a condition of the scene (``fields.conditions``). Where it does not hold the name is None.
 """
 
@@ -192,16 +190,14 @@ CONTACT: Group = {
     "node_segments": Field("node", 4, "int", "", "middles", "segments at a node, or -1"),
     "sample_is_free": Field("sample", 1, "int", "", "middles", "0 where any of its nodes is held, else 1"),
     "sample_moves": Field("sample", 1, "int", "", "middles", "0 where all of its nodes are held, else 1"),
-    "sample_position": Field("sample", 1, "vec3", "m", "middles", "what samples have of the nodes' x"),
-    "sample_velocity": Field("sample", 1, "vec3", "m/s", "middles", "the same of ẋ"),
-    "sample_increment": Field("sample", 1, "vec3", "m/s", "middles", "the same of v₀ − w"),
-    "sample_direction": Field("sample", 1, "vec3", "m/s", "middles", "the same of δ"),
-    "sample_base_position": Field("sample", 1, "vec3", "m", "middles", "the same of q₀"),
-    "sample_solution": Field("sample", 1, "vec3", "m/s", "middles", "the same of w"),
     "sample_force": Field("sample", 1, "vec3", "N", "middles", "on samples, to be scattered to nodes"),
     "sample_block": Field("sample", 1, "mat33", "kg", "middles", "the same of the matrix"),
     "taken_by": Field("node", 1, "int", "", "middles", "the obstacle that a node starts a stage beside, from 1, or 0"),
 }
+for _name in ("position", "base_position", "velocity", "increment", "direction", "solution"):
+    CONTACT[f"sample_{_name}"] = Field(
+        "sample", 1, "vec3", "m" if "pos" in _name else "m/s", "middles", "what samples have of that of nodes"
+    )
 """What contact finds (``kernels/contact``)."""
 
 CONTACT_INPUTS: Group = {
