@@ -357,3 +357,42 @@ def test_contacts_tell_middles() -> None:
     ball = wy.Sphere(center=(2.5e-3, 2e-3, 0.0), radius=7e-4)
     with pytest.raises(wy.InputError, match=r"the middle between node 14 \(.*\) and node 15 \(.* from obstacles\[0\]"):
         wy.Simulator(scene.replace(cloth=cloth, obstacles=[ball]), integrator="implicit-euler")
+
+
+def roughness(samples: str, load: float, places: int) -> tuple[float, tuple[float, float]]:
+    """The largest sideways force over the load of two rigid sheets that lie on each other somewhere, without friction,
+    and how far apart they lie, in spacings: at a load on a node, in parts of κ d̂ of a node."""
+    lower, upper = paper(15, 15), paper(5, 5)
+    contact = wy.Contact(friction=0.0, samples=samples)
+    scene = wy.Scene([lower, lifted(upper, 5e-3)], self_contact=True, gravity=None, contact=contact, sliding=False)
+    simulator = wy.Simulator(scene, integrator="implicit-euler")
+    reach = float(numbers(simulator, "self_contact_range")[0])
+    stiffness = float(numbers(simulator, "self_contact_stiffness")[0]) * (1.0 if samples == "nodes" else 9.0)
+    wanted = load * stiffness * reach * 25.0
+    random, state, largest, heights = np.random.default_rng(0), simulator.state, 0.0, []
+    for _ in range(places):
+        at = np.array([*random.uniform(4.5e-3, 5.5e-3, 2), 0.0])
+
+        def force(height: float, at: np.ndarray = at) -> np.ndarray:
+            state.position[225:] = upper.position + at + (0.0, 0.0, height)
+            return simulator.forces(state)["self_contact"][0][225:].sum(axis=0)
+
+        low, high = 1.52e-3, 2.5e-3
+        while high - low > 1e-8:
+            middle = 0.5 * (low + high)
+            # nearer than D has no load
+            f = force(middle)
+            low, high = (middle, high) if not np.isfinite(f).all() or f[2] > wanted else (low, middle)
+        f = force(high)
+        largest = max(largest, float(np.hypot(f[0], f[1]) / f[2]))
+        heights.append(high / lower.spacing)
+    return largest, (min(heights), max(heights))
+
+
+@pytest.mark.parametrize(("load", "of_nodes", "of_middles"), [(1e-3, 0.30, 0.08), (1e-1, 0.12, 0.03)])
+def test_layers_slide_more_smoothly(load: float, of_nodes: float, of_middles: float) -> None:
+    """Of balls that lock, as crowns of a weave do: at a sheet's own weight, about, and pressed together."""
+    nodes, _ = roughness("nodes", load, 6)
+    middles, heights = roughness("nodes+mids", load, 6)
+    assert nodes < of_nodes and middles < of_middles and middles < 0.5 * nodes
+    assert 2.1 < heights[0] < heights[1] < 2.5
