@@ -333,7 +333,9 @@ def draw(table: Sequence[dict[str, Any]], size: int) -> Figure:
                 axis.axhline(1.0, color="0.6", linewidth=1.0, zorder=0)
             axis.grid(color="0.9")
             axis.xaxis.set_minor_formatter(NullFormatter())
-    axes[0, 0].legend(frameon=False)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=len(METHODS), frameon=False
+    )
     return figure
 
 

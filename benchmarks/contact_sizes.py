@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from plots import COLORS, MARKERS, PICTURES, save
 
 import warp_yarn as wy
-from warp_yarn.device.declarations import CONTACT, CONTACT_INPUTS
+from warp_yarn.device.contact_declarations import CONTACT, CONTACT_INPUTS
 
 SETTLED = 30
 """Steps before the clock: the sheets lie then."""

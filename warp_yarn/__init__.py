@@ -7,7 +7,9 @@ from types import ModuleType
 from . import moved
 from .description.cloth import Cloth
 from .description.cloths import Cloths
+from .description.crimp import crimp_height
 from .description.draft import Draft
+from .description.fibre import FIBRES, Fibre
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
@@ -31,6 +33,7 @@ moved.install()
 __version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
+    "FIBRES",
     "WEAVES",
     "Box",
     "Capsule",
@@ -39,6 +42,7 @@ __all__ = [
     "Contact",
     "Cylinder",
     "Draft",
+    "Fibre",
     "GradientError",
     "InputError",
     "Plane",
@@ -59,6 +63,7 @@ __all__ = [
     "Wind",
     "Yarn",
     "__version__",
+    "crimp_height",
     "fabrics",
     "paper",
     "read_draft",

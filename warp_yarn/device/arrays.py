@@ -18,7 +18,7 @@ from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
-from . import contact, declarations
+from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
 
@@ -76,6 +76,7 @@ class Arrays(DeclaredArrays):
         for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
             self.make(group)
         contact.set_arrays(self)
+        crimp.set_arrays(self)
 
     def node_mass(self) -> float:
         """Compute the mean mass of a node [kg]."""
@@ -154,8 +155,8 @@ class Arrays(DeclaredArrays):
             elif not general or name not in ("spacing", "radius"):
                 self[name] = self.numbers(getattr(cloth, name))
         if general:
-            self["spacing"] = self.numbers(cloth.node_spacing.ravel())
-            self["radius"] = self.numbers(cloth.halves.ravel())
+            self["spacing"] = self.numbers(np.concatenate([cloth.node_spacing, cloth.node_widths]).ravel())
+            self["radius"] = self.numbers(np.append(cloth.halves, 1.0 + cloth.yarn_crimp))
             self["lock_angle"] = self.numbers(cloth.corner_lock.ravel())
         else:
             self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
@@ -212,8 +213,8 @@ def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:
     """Count what the numbers of a cloth are of: one of each in a plain cloth."""
     topology = cloth.topology
     counts = {
-        "gap": 2 * topology.nodes,
-        "half": 2 * len(topology.yarn_direction),
+        "gap": 4 * topology.nodes,
+        "half": 3 * len(topology.yarn_direction),
         "corner": 4 * len(topology.crossing_node),
         "cloth crossing": topology.nodes,
     }

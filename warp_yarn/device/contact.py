@@ -12,7 +12,7 @@ from ..description.obstacles import TriangleMesh
 from ..description.scene import Scene
 from ..errors import InputError
 from ..kernels.contact import distances
-from . import declarations, samples
+from . import contact_declarations, samples
 from .energy_watch import AT_START
 from .samples import Samples
 
@@ -86,7 +86,7 @@ def set_arrays(arrays: Arrays) -> None:
         samples.set_arrays(arrays)
     arrays["near_room"] = 0
     arrays["face_room"] = FACE_ROOM if arrays.sizes["near face"] else 0
-    arrays.make(declarations.CONTACT)
+    arrays.make(contact_declarations.CONTACT)
 
 
 def _set_law(arrays: Arrays, kind: str, distance: float, reach: float) -> None:
