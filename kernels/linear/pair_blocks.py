@@ -1,6 +1,6 @@
 """Blocks of the matrix beyond the weave's stencil: of nodes that touch, wherever they are along the cloth.
 
-    y += C x,   C_pq = −B_pq = C_qp,   of every pair p, q of a list
+    y += C x,   C_pq = −B_pq = C_qp,   of every pair p, q that touched when the matrix was filled
 
 Where middles of segments touch as well, x is theirs, the mean of both ends, and half of y goes to either.
 
@@ -37,9 +37,9 @@ def functions(variant: Variant) -> SimpleNamespace:
     def row(pairs: Pairs, nodes: int, p: int, x: wp.array(dtype=vec3)) -> vec3:
         """Compute the row of C x of a sample."""
         total = vec3()
-        for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
-            b = pairs.near_block[k]
-            z = sample(pairs, nodes, pairs.near[k], x)
+        for k in range(p * pairs.touch_room, p * pairs.touch_room + pairs.touch_count[p]):
+            b = pairs.touch_block[k]
+            z = sample(pairs, nodes, pairs.touch[k], x)
             total -= vec3(
                 b[0] * z[0] + b[1] * z[1] + b[2] * z[2],
                 b[1] * z[0] + b[3] * z[1] + b[4] * z[2],
@@ -69,9 +69,9 @@ def functions(variant: Variant) -> SimpleNamespace:
         energy = scalar(0.0)
         for p in range(begin, end):
             total = vec3()
-            for k in range(p * pairs.near_room, p * pairs.near_room + pairs.near_count[p]):
-                b = pairs.near_block[k]
-                z = x[pairs.near[k]]
+            for k in range(p * pairs.touch_room, p * pairs.touch_room + pairs.touch_count[p]):
+                b = pairs.touch_block[k]
+                z = x[pairs.touch[k]]
                 total -= vec3(
                     b[0] * z[0] + b[1] * z[1] + b[2] * z[2],
                     b[1] * z[0] + b[3] * z[1] + b[4] * z[2],

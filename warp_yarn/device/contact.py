@@ -57,6 +57,7 @@ def sizes(scene: Scene) -> dict[str, int]:
         "sample": samples,
         "face": max(faces, 1),
         "near": 0,
+        "touch": 0,
         "near face": FACE_ROOM * samples if faces else 0,
     }
 
@@ -84,7 +85,7 @@ def set_arrays(arrays: Arrays) -> None:
         arrays["rest_place"] = arrays.numbers(place.ravel())
     if "middles" in arrays.conditions:
         samples.set_arrays(arrays)
-    arrays["near_room"] = 0
+    arrays["near_room"] = arrays["touch_room"] = 0
     arrays["face_room"] = FACE_ROOM if arrays.sizes["near face"] else 0
     arrays.make(contact_declarations.CONTACT)
 
@@ -182,13 +183,17 @@ class Contact:
             self.make_room(NEAR_ROOM)
 
     def make_room(self, room: int | None = None) -> None:
-        """Make room for so many samples near each, or for twice as many, and as many faces; the next look makes a
-        list."""
+        """Make room for so many samples near each, or for twice as many of what is full, and twice as many faces; the
+        next look makes a list."""
         a = self.model.arrays
         if self.self_contact:
-            a["near_room"] = room or 2 * a["near_room"]
-            a.sizes["near"] = a["near_room"] * self.samples.count
-            a["near"], a["near_block"] = a.new("near"), a.new("near_block")
+            # of what is near, half may touch
+            for kind, part, arrays in (("near", 1, ("near",)), ("touch", 2, ("touch", "touch_block"))):
+                if room or int(a[f"{kind}_count"].numpy().max()) >= a[f"{kind}_room"]:
+                    a[f"{kind}_room"] = max(room // part, 1) if room else 2 * a[f"{kind}_room"]
+                    a.sizes[kind] = a[f"{kind}_room"] * self.samples.count
+                    for name in arrays:
+                        a[name] = a.new(name)
             # far from everywhere
             a["near_position"].fill_(np.nan)
         if self.has_mesh and room is None:

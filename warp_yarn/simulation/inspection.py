@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -187,16 +188,16 @@ class Inspection:
         with _Visit(self.stepper, state, ahead=True):
             self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
-            self.model.assemble()
+            with_room(self.stepper, self.model.assemble)
             return read_system(self.model)
 
 
-def find_with_room(stepper: Stepper) -> None:
-    """Looks for what touches at the present positions, and makes room until there is enough for it."""
-    stepper.model.contact.find()
+def with_room(stepper: Stepper, look: Callable[[], None]) -> None:
+    """Does what looks for what touches at the present positions, and makes room until there is enough for it."""
+    look()
     while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
         stepper.make_room()
-        stepper.model.contact.find()
+        look()
 
 
 class _Visit:
@@ -228,7 +229,7 @@ class _Visit:
         model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
-        find_with_room(stepper)
+        with_room(stepper, model.contact.find)
 
     def __exit__(self, *_: object) -> None:
         self.stepper.pay()
