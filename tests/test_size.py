@@ -27,7 +27,7 @@ VERBS = set(
         end enter erase estimate evaluate exchange expand extend extrapolate factorize fail fetch fill find finish
         fit flatten follow forget free freeze gather get give go group guess halve hand hold identify ignore import
         initialize insert install integrate interpolate invert iterate join judge keep know launch learn leave let
-        limit linearize list load look lower lump make match measure merge minimize mirror mix move multiply name
+        limit linearize list load look lower lump make mark match measure merge minimize mirror mix move multiply name
         normalize note number open pack parse pass pay perform pick place plot prepare prescribe press print probe
         produce project propagate prove pull push put raise reach read ready rebuild recall receive record recover
         reduce refine refuse register release remember remove rename reorder repeat replace replay report request reset

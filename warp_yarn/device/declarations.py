@@ -2,15 +2,13 @@
 
 Arrays are made from these declarations (``arrays.py``), and no other name can be set or launched with. A test holds
 every argument of every kernel to them (``tests/kernels/test_declarations.py``). A group is what is made together.
-
-One **world** is one independent simulation of a batch. Today there is one; what steers it (status, step length,
-tolerances, counters) is an array over worlds all the same.
-
+One **world** is one independent simulation of a batch, today the only one: what steers it is an array over worlds.
 The field ``when`` names a condition of the scene (``fields.conditions``). Where it does not hold the name is None.
 """
 
 import dataclasses
 
+from .contact_declarations import CONTACT, CONTACT_INPUTS
 from .fields import Field, Group
 
 TOPOLOGY: Group = {
@@ -177,54 +175,6 @@ LEVELS: Group = {
 }
 """Of the multilevel preconditioner (``description/levels.py``): one struct, ``arrays["levels"]``."""
 
-CONTACT: Group = {
-    "touching": Field("world", 3, "int", "", "always", "whether anything touches, two nodes, anything so fast"),
-    "obstacle_velocity": Field("obstacle", 1, "vec3", "m/s", "obstacles", "ṗ"),
-    "obstacle_spin": Field("obstacle", 1, "vec3", "rad/s", "obstacles", "ω"),
-    "face_room": Field("count", 1, "int", "", "always", "places of a node in the list of faces that are near"),
-    "face_count": Field("node", 1, "int", "", "obstacles", "how many of them are taken"),
-    "near_face": Field("near face", 1, "int", "", "obstacles", "faces that are near it, of all meshes"),
-    "near_room": Field("count", 1, "int", "", "always", "places of a node in the list of what is near"),
-    "near_count": Field("node", 1, "int", "", "self-contact", "how many of them are taken"),
-    "near": Field("near", 1, "int", "", "self-contact", "nodes that are near it"),
-    "near_block": Field("near", 1, "sym33", "kg", "self-contact", "matrix block of those that touch it, or 0"),
-    "near_position": Field("node", 1, "vec3", "m", "self-contact", "where nodes were when the list was made"),
-    "outdated": Field("world", 1, "int", "", "self-contact", "whether it has to be made anew"),
-}
-"""What contact finds (``kernels/contact``)."""
-
-CONTACT_INPUTS: Group = {
-    "contact_stiffness": Field("world", 1, "scalar", "N/m", "obstacles", "κ of nodes on obstacles"),
-    "contact_distance": Field("world", 1, "scalar", "m", "obstacles", "D"),
-    "contact_range": Field("world", 1, "scalar", "m", "obstacles", "d̂"),
-    "contact_slip_speed": Field("world", 1, "scalar", "m/s", "obstacles", "ε"),
-    "contact_damping_speed": Field("world", 1, "scalar", "m/s", "obstacles", "v_d"),
-    "self_contact_stiffness": Field("world", 1, "scalar", "N/m", "self-contact", "κ of nodes on nodes"),
-    "self_contact_distance": Field("world", 1, "scalar", "m", "self-contact", "D"),
-    "self_contact_range": Field("world", 1, "scalar", "m", "self-contact", "d̂"),
-    "self_contact_slip_speed": Field("world", 1, "scalar", "m/s", "self-contact", "ε"),
-    "self_contact_damping_speed": Field("world", 1, "scalar", "m/s", "self-contact", "v_d"),
-    "contact_friction": Field("world", 1, "scalar", "", "self-contact", "μ of cloth on cloth"),
-    "near_margin": Field("world", 1, "scalar", "m", "self-contact", "beyond D + d̂ of the list of what is near"),
-    "rest_place": Field("node", 2, "scalar", "m", "self-contact", "(u, v) at rest, far apart on different cloths"),
-    "obstacle_shape": Field("obstacle", 1, "int", "", "obstacles", "as contact/distances.py numbers them"),
-    "obstacle_size": Field("obstacle", 1, "vec3", "m", "obstacles", "what a shape has for numbers"),
-    "obstacle_friction": Field("obstacle", 1, "scalar", "", "obstacles", "μ"),
-    "obstacle_position": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of a stage"),
-    "obstacle_rotation": Field("obstacle", 1, "quat", "", "obstacles", "R"),
-    "obstacle_position_before": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of the state before"),
-    "obstacle_rotation_before": Field("obstacle", 1, "quat", "", "obstacles", "R"),
-    "obstacle_position_start": Field("obstacle", 1, "vec3", "m", "obstacles move", "p before the first step"),
-    "obstacle_rotation_start": Field("obstacle", 1, "quat", "", "obstacles move", "R"),
-    "obstacle_position_path": Field("obstacle step", 1, "vec3", "m", "obstacles move", "p after every step"),
-    "obstacle_rotation_path": Field("obstacle step", 1, "quat", "", "obstacles move", "R"),
-    "meshes": Field("obstacle", 1, "uint64", "", "obstacles", "Warp's mesh, or 0"),
-    "first_face": Field("obstacle", 1, "int", "", "obstacles", "of a mesh, among all faces"),
-    "face_obstacle": Field("face", 1, "int", "", "obstacles", "the mesh of a face"),
-    "mesh_corner": Field("face", 3, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
-}
-"""What a scene says of contact. What it does not have is not in the arrays at all."""
-
 CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
     "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
     "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
@@ -353,6 +303,7 @@ LAUNCH: Group = {
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),
     "share": Field("launch", 1, "scalar", "", "always", "of a stage in what a step makes"),
     "step_duration": Field("launch", 1, "scalar", "s", "always", "h of a whole step"),
+    "is_last": Field("launch", 1, "int", "", "always", "whether what is in the way is a failure"),
     "moves": Field("launch", 1, "int", "", "always", "whether to look at where a step would lead"),
     "grid": Field("launch", 1, "uint64", "", "always", "Warp's hash grid"),
     "gaps": Field("launch", 1, "vec4", "1, m", "always", "(n, g) of what is near"),
