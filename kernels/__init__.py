@@ -122,6 +122,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     kernels = {
         "contact_normal": crossing_normal.define_normal(variant),
         "update_anchor": friction.define_anchor(variant),
+        "gusty_wind": wind.define_gusty(variant),
     }
     kernels |= vars(crimped_contact.define(variant))
     for term in _OWN:

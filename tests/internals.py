@@ -166,6 +166,10 @@ def left_of_the_last_stage(simulator: wy.Simulator) -> float:
     return np.sqrt(slope) / change / newton_tolerance(simulator, simulator.step_size)
 
 
+def watches_energy(simulator: wy.Simulator) -> bool:
+    return simulator.model.energy.on
+
+
 def fails_at_first(simulator: wy.Simulator, largest: float) -> None:
     """Makes a simulator fail in its first step, wherever it tries more of it at once than so much [s]."""
     advance, arrays = simulator.integrator.advance, simulator.arrays
@@ -285,3 +289,8 @@ def resolved_with_its_adjoint(
     made = Projected(rounds, start, inverse_mass, np.zeros(0), found - end, 1.0)
     to_start, to_end, _ = zones.taken_back(made, adjoint)
     return found, to_start, to_end, active
+
+
+def room_for_near(simulator: wy.Simulator) -> int:
+    """Places of each node in the list of what is near."""
+    return simulator.arrays["near_room"]

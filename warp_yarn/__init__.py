@@ -14,7 +14,7 @@ from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Spher
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
-from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
+from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError, WarpYarnWarning
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
 from .io.draft import read_draft, write_draft
@@ -59,6 +59,7 @@ __all__ = [
     "TriangleMesh",
     "Variant",
     "WarpYarnError",
+    "WarpYarnWarning",
     "Weave",
     "Wind",
     "Yarn",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, real
+from .sanity import warn_of_units
 from .topology import Topology, rectangle
 from .weave import Weave
 from .woven import (
@@ -130,6 +131,7 @@ class Cloth(Woven):
             friction_damping=None if friction_damping is None else self.friction_damping,
             pose=pose if isinstance(pose, str) else self.position,
         )
+        warn_of_units(self)
 
     def __repr__(self) -> str:
         if isinstance(self.spacing, float):

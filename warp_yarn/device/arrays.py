@@ -62,6 +62,8 @@ class Arrays(DeclaredArrays):
             "crossing": len(topology.crossing_node),
             "triangle": len(topology.triangle_nodes),
             "pin": len(scene.pins),
+            "gravity step": _rows(scene.gravity),
+            "wind step": 1 if scene.wind is None else _rows(scene.wind.velocity),
             "pin step": 0 if scene.pin_path is None else scene.pin_path[..., 0].size,
             "applied": len(scene.force_nodes),
             "applied step": scene.force_path[..., 0].size,
@@ -118,9 +120,9 @@ class Arrays(DeclaredArrays):
             self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
         self._cloth_numbers(cloth)
         if scene.gravity is not None:
-            self["gravity"] = self.numbers(scene.gravity[None])
+            self._vectors("gravity", scene.gravity)
         if scene.wind is not None:
-            self["wind_velocity"] = self.numbers(np.asarray(scene.wind.velocity)[None])
+            self._vectors("wind_velocity", scene.wind.velocity)
             self["wind_density"] = self.numbers(scene.wind.density)
             self["wind_drag"] = self.numbers(scene.wind.drag)
         if len(scene.pins):
@@ -145,6 +147,13 @@ class Arrays(DeclaredArrays):
             self.declare(name, Field(element, 1, kind, parameter.unit, "always", "of a term from outside the package"))
             value = scene.registered_value(name)
             self[name] = self.numbers(value[cloth.material] if parameter.of == "yarn" else value[None])
+
+    def _vectors(self, name: str, value: Any) -> None:
+        """Sets a vector, and the rows of one that changes; what a function says comes before each step."""
+        rows = np.zeros((1, 3)) if callable(value) else np.asarray(value).reshape(-1, 3)
+        self[name] = self.numbers(rows[:1])
+        if np.ndim(value) == 2:
+            self[f"{name}_path"] = self.numbers(rows)
 
     def _cloth_numbers(self, cloth: Cloth | Cloths) -> None:
         """Fill what a cloth says in numbers: single ones, or in a general cloth those of every segment, yarn, ..."""
@@ -207,6 +216,11 @@ class Arrays(DeclaredArrays):
         self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
         self.dims["coarse_warp_lines"] = found.coarse_warp_lines
         self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
+
+
+def _rows(value: Any) -> int:
+    """Counts the steps for which a vector is given; 1 of one that does not change."""
+    return len(value) if np.ndim(value) == 2 else 1
 
 
 def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Arrays of contact, declared as ``declarations.py`` says."""
+"""Arrays of what touches, and of what presses crossings: groups of ``declarations.py``."""
 
 from .fields import Field, Group
 
@@ -68,3 +68,11 @@ CONTACT_INPUTS: Group = {
     "mesh_corner": Field("face", 3, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
+
+CRIMP: Group = {
+    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
+    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
+    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
+    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
+}
+"""Of crimp interchange, and of the contact force at crimped positions; others have none of it."""

@@ -8,7 +8,7 @@ The field ``when`` names a condition of the scene (``fields.conditions``). Where
 
 import dataclasses
 
-from .contact_declarations import CONTACT, CONTACT_INPUTS
+from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
 from .fields import Field, Group
 
 TOPOLOGY: Group = {
@@ -54,8 +54,10 @@ one (``kernels/core/general.py``) four gaps of each node, three halves of each y
 as many cloth crossings as nodes."""
 
 INPUTS: Group = {
-    "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g"),
-    "wind_velocity": Field("world", 1, "vec3", "m/s", "has wind", "of the air"),
+    "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g, in this step"),
+    "gravity_path": Field("gravity step", 1, "vec3", "m/s²", "gravity changes", "in every step"),
+    "wind_velocity": Field("world", 1, "vec3", "m/s", "has wind", "of the air, in this step"),
+    "wind_velocity_path": Field("wind step", 1, "vec3", "m/s", "wind changes", "in every step"),
     "wind_density": Field("world", 1, "scalar", "kg/m³", "has wind", "ρ_w"),
     "wind_drag": Field("world", 1, "scalar", "kg/(m² s)", "has wind", "c_d"),
     "pin_node": Field("pin", 1, "int", "", "has pins", "its node"),
@@ -93,6 +95,7 @@ STEP: Group = {
 ASSEMBLY: Group = {
     "normal": Field("node", 1, "vec3", "", "contact", "from warp to weft, 0 on the border"),
     "contact_load": Field("node", 1, "scalar", "N", "contact", "what presses warp and weft together, where above 0"),
+    "gust": Field("node", 1, "vec3", "m/s", "gusts", "velocity of the air at a node, beside wind_velocity"),
     "force": Field("node", 1, "vec3", "N", "always", "F of the positions"),
     "euler_force": Field("node", 2, "scalar", "N", "sliding", "F of (u, v), but for friction"),
     "friction_force_out": Field("node", 2, "scalar", "N", "friction", "friction's F of (u, v)"),
@@ -174,13 +177,6 @@ LEVELS: Group = {
     "coarse_z": Field("coarse node", 1, "vec3", "m/s", "always", "preconditioned residual"),
 }
 """Of the multilevel preconditioner (``description/levels.py``): one struct, ``arrays["levels"]``."""
-
-CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
-    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
-    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
-    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
-    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
-}
 
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
@@ -310,6 +306,7 @@ LAUNCH: Group = {
     "contact_forces": Field("launch", 1, "vec3", "N", "always", "of what touches"),
     "source": Field("launch", 1, "any", "", "always", "array to copy"),
     "target": Field("launch", 1, "any", "", "always", "array to copy into"),
+    "origin": Field("launch", 1, "vec3", "m", "always", "where positions are counted from"),
     "array": Field("launch", 1, "any", "", "always", "array to clear"),
     "path": Field("launch", 1, "vec3", "", "always", "an input's rows, step after step"),
     "values": Field("launch", 1, "vec3", "", "always", "an input in this step"),

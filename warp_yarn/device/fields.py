@@ -3,9 +3,11 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from ..description.scene import Scene
+from ..description.varying import has_gusts
 from ..kernels import Term, Variant, own
 
 
@@ -55,6 +57,9 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "wind": "wind" in names or others,
         "has gravity": scene.gravity is not None,
         "has wind": scene.wind is not None,
+        "gravity changes": isinstance(scene.gravity, np.ndarray) and scene.gravity.ndim == 2,
+        "wind changes": scene.wind is not None and np.ndim(scene.wind.velocity) == 2,
+        "gusts": has_gusts(scene.functions),
         "has pins": len(scene.pins) > 0,
         "hard pins": len(scene.pins) > 0 and scene.pin_stiffness is None,
         "spring pins": len(scene.pins) > 0 and scene.pin_stiffness is not None,

@@ -12,6 +12,7 @@ import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
+from ..description.varying import has_gusts
 from ..errors import InputError, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build, own
 from ..kernels.core.general import NUMBERS
@@ -41,7 +42,7 @@ class Model:
 
     Args:
         scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations, threads,
-            differentiable: as of the Simulator.
+            differentiable: as of the Simulator; hooked: whether it has a hook.
 
     Attributes:
         arrays: by the names that kernels use.
@@ -67,6 +68,7 @@ class Model:
         max_iterations: int | None,
         threads: int,
         differentiable: bool,
+        hooked: bool = False,
     ):
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {scene!r}, must be a Scene")
@@ -90,7 +92,7 @@ class Model:
         _check_inputs(self)
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
-        self.inputs = Inputs(self)
+        self.inputs = Inputs(self, hooked=hooked)
         self.contact = Contact(self)
         self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)
@@ -268,7 +270,11 @@ def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
     """Builds the kernels of a scene's terms, of which one may have been registered when the scene was made."""
     for name in scene.terms:
         choice("scene.terms", name, TERMS)
-    return build(variant, scene.terms)
+    kernels = build(variant, scene.terms)
+    if has_gusts(scene.functions):
+        gusty = {name.removeprefix("gusty_"): name for name in kernels if name.startswith("gusty_")}
+        kernels = kernels | {name: kernels[other] for name, other in gusty.items()}
+    return kernels
 
 
 def _check_inputs(model: Model) -> None:

@@ -18,6 +18,9 @@ from .linear_system import LinearSystem, read_system
 from .state import FIELDS, State
 from .stepper import Stepper
 
+GIVEN = ("gravity", "wind_velocity", "gust", "applied_force", "applied_force_path")
+"""Arrays that functions are evaluated into."""
+
 
 class Inspection:
     """Looks into the present state or another one, and leaves no trace. The base of the simulator, which has these:
@@ -41,7 +44,7 @@ class Inspection:
         """
         a, cloth, result = self.model.arrays, self.model.scene.cloth, {}
         crossing = np.repeat(cloth.topology.is_crossing != 0, 2)
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             total = np.zeros(2 * cloth.nodes)
             for term in a.terms:
@@ -74,7 +77,7 @@ class Inspection:
         a = self.model.arrays
         if not a.contact:
             raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             load = a["contact_load"].numpy().astype(np.float64)
             return a["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
@@ -89,7 +92,7 @@ class Inspection:
         if self.model.zones is not None:
             raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
         contact, found = self.model.contact, []
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
             if contact.obstacles:
                 found.append(contact.near_obstacles())
@@ -111,7 +114,7 @@ class Inspection:
         contact = self.model.contact
         if not contact.on:
             return
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             found = [contact.near_pairs()] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move
             where_known = state is None or not contact.obstacles_move
@@ -130,7 +133,7 @@ class Inspection:
         """Tells what is nearest to a node of the present state, with obstacles where the next step
         has them; or ""."""
         contact = self.model.contact
-        with _Visit(self.stepper, None, ahead=True):
+        with Visit(self.stepper, None, ahead=True):
             found = [contact.near_pairs()] if contact.self_contact else []
             found += [contact.near_obstacles()] if contact.obstacles else []
             found += [contact.near_faces()] if contact.has_mesh else []
@@ -164,7 +167,7 @@ class Inspection:
     def energy(self, state: State | None = None) -> dict[str, float]:
         """Computes the energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.model.arrays, {}
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             energy = a.zeros(1, a.variant.scalar)
             for term in a.terms:
@@ -185,37 +188,56 @@ class Inspection:
             weights: factors of M, D and H in its matrix; None: 1, h and h².
         """
         h = self.model.step_size
-        with _Visit(self.stepper, state, ahead=True):
+        with Visit(self.stepper, state, ahead=True):
             self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             with_room(self.stepper, self.model.assemble)
             return read_system(self.model)
 
 
-def with_room(stepper: Stepper, look: Callable[[], None]) -> None:
-    """Does what looks for what touches at the present positions, and makes room until there is enough for it."""
+def with_room(stepper: Stepper, look: Callable[[], None]) -> bool:
+    """Does what looks for what touches at the present positions, which no step may have come to, and makes room until
+    there is enough for it; tells whether it had to."""
     look()
+    made = False
     while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
         stepper.make_room()
         look()
+        made = True
+    return made
 
 
-class _Visit:
+class Visit:
     """Another state for as long as a block lasts; the arrays that a step works with are free for it.
 
-    Pins and applied forces are those of the last step, or, if asked for, of the next one.
+    Pins and applied forces are those of the last step, or, if asked for, of the next one, or of the step after so many
+    (``row``), whose stages are then at their times. Functions are evaluated where the cloth is, or where that step
+    began.
     """
 
-    def __init__(self, stepper: Stepper, state: State | None, *, ahead: bool = False):
+    def __init__(
+        self,
+        stepper: Stepper,
+        state: State | None,
+        *,
+        ahead: bool = False,
+        row: int | None = None,
+        begun: np.ndarray | None = None,
+    ):
         self.stepper = stepper
-        self.ahead = ahead
-        self.row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.ahead, self.by_stages = ahead, row is not None
+        if row is None:
+            row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.row, self.begun = row, begun
         self.visited = None if state is None else checked_state(state, stepper.model.scene)
 
     def __enter__(self) -> None:
         stepper, model, home = self.stepper, self.stepper.model, {}
         if self.visited is not None:
             home = {name: model.arrays[name].numpy().copy() for name in FIELDS if stepper.frames.moves(name)}
+        if model.inputs.functions:
+            given = [name for name in GIVEN if model.arrays.get(name) is not None]
+            home |= {name: model.arrays[name].numpy().copy() for name in given}
 
         def go_home() -> None:
             for name, value in home.items():
@@ -224,9 +246,13 @@ class _Visit:
 
         stepper.owe(go_home)
         model.arrays.put("counters", 0, self.row)
-        # before the first step, pins are where they start
-        model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
-        model.inputs.load()
+        if model.inputs.functions:
+            begun = self.visited.position if self.begun is None and self.visited is not None else self.begun
+            model.inputs.evaluate(self.row, stepper.frames.state().position if begun is None else begun)
+        if not self.by_stages:
+            # before the first step, pins are where they start
+            model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
+            model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
         with_room(stepper, model.contact.find)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,12 @@ from ..description.obstacles import Box, Capsule, Contact, Cylinder, Obstacle, P
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
 from ..description.yarn import SIZES, Yarn
-from ..errors import InputError, choice, finite_array, integer, real
+from ..errors import InputError, WarpYarnWarning, choice, finite_array, integer, real
 from ..io.files import atomic_write
 
-FORMAT = 4
+FORMAT = 5
 """Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth; 3 had
-single numbers of cloths, no crimp and no sizes of yarns."""
+single numbers of cloths, no crimp and no sizes of yarns; 4 had no wind that changes from step to step."""
 
 SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
@@ -150,7 +151,13 @@ class Trajectory:
         return dataclasses.replace(self, **parts)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes an .npz file with the cloth, its scene and every frame; it appears whole or not at all."""
+        """Writes an .npz file with the cloth, its scene and every frame; it appears whole or not at all. A scene with
+        functions is left out, with a WarpYarnWarning: no file holds them."""
+        packed = {} if self.scene is None or self.scene.functions else _packed(self.scene)
+        if self.scene is not None and self.scene.functions:
+            given = ", ".join(map(str, self.scene.functions))
+            text = f"{Path(path)} is written without its scene: functions ({given}) cannot be kept"
+            warnings.warn(text, WarpYarnWarning, stacklevel=2)
         with atomic_write(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
@@ -159,7 +166,7 @@ class Trajectory:
                 step=self.step,
                 **_packed_cloths(self.cloth),
                 **{name: getattr(self, name) for name in FIELDS},
-                **({} if self.scene is None else _packed(self.scene)),
+                **packed,
             )
 
     @classmethod
@@ -269,7 +276,8 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "pins": scene.pins,
         "pin_stiffness": scene.pin_stiffness,
         "pin_path": scene.pin_path,
-        "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
+        "wind": None if wind is None else [*np.reshape(wind.velocity, (-1, 3))[0], wind.density, wind.drag],
+        "wind_path": None if wind is None or np.ndim(wind.velocity) == 1 else wind.velocity,
         "force_nodes": scene.force_nodes,
         **{f"force_{node}": force for node, force in scene.forces.items()},
         "parameters": list(scene.parameters) or None,
@@ -294,10 +302,11 @@ def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         return data.get(f"scene_{name}")
 
     wind, stiffness, named = value("wind"), value("pin_stiffness"), value("parameters")
+    velocity = None if wind is None else wind[:3] if value("wind_path") is None else value("wind_path")
     return Scene(
         cloth,
         gravity=value("gravity"),
-        wind=None if wind is None else Wind(velocity=wind[:3], density=wind[3], drag=wind[4]),
+        wind=None if wind is None else Wind(velocity=velocity, density=wind[3], drag=wind[4]),
         pins=value("pins"),
         pin_stiffness=None if stiffness is None else stiffness.item(),
         pin_path=value("pin_path"),
