@@ -18,6 +18,7 @@ from warp_yarn.device.contact import Near
 from warp_yarn.device.impact_zones import Projected
 from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
+from warp_yarn.simulation.inspection import with_room
 from warp_yarn.simulation.linear_system import read_system
 from warp_yarn.view import render
 
@@ -98,9 +99,22 @@ def near_faces(simulator: wy.Simulator) -> Near:
     return simulator.model.contact.near_faces()
 
 
+def near_pairs(simulator: wy.Simulator) -> Near:
+    """Every two samples that are near each other, with room for all of them."""
+    with_room(simulator.stepper, simulator.model.contact.find)
+    return simulator.model.contact.near_pairs()
+
+
 def near_room(simulator: wy.Simulator) -> int:
     """Places of a node in the list of what is near."""
     return int(simulator.arrays["near_room"])
+
+
+def set_near_room(simulator: wy.Simulator, room: int) -> None:
+    """Leaves a sample so many places for what is near it."""
+    simulator.model.contact.make_room(room)
+    simulator.integrator.forget_graphs()
+    simulator.stepper.substepping.forget_graphs()
 
 
 def obstacles_begin_a_step(simulator: wy.Simulator) -> None:
@@ -189,8 +203,8 @@ def gain_in_a_part(simulator: wy.Simulator, size: float, left: float) -> list[fl
     substepping, gained = simulator.substepping, []
     attempt = substepping._try
 
-    def made(method: object, count: Callable[[], None], *part: float) -> bool:
-        good = attempt(method, count, *part)
+    def made(method: object, count: Callable[[], None], make_room: Callable[[], None], *part: float) -> bool:
+        good = attempt(method, count, make_room, *part)
         if method is simulator.integrator and part == (size, left):
             put(simulator, "status", [GAINED, -1, 0])
             gained.append(size)

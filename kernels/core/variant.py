@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
-ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "pins", "applied", "node_obstacles")
-"""What a term's kernel may run over."""
+ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "pins", "applied", "samples", "sample_obstacles")
+"""What a term's kernel may run over. Samples are what touches: nodes, or points between them too."""
 
 
 @dataclasses.dataclass(frozen=True)

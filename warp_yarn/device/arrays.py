@@ -42,6 +42,9 @@ class Arrays(DeclaredArrays):
         self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
+        if scene.contact.samples != "nodes":
+            # a middle couples the ends of its segment
+            self.stencil = max(self.stencil, 2)
         # Single precision far from 0 would lose the cloth itself: a kilometre away its unit is 60 µm. What is
         # differentiated by positions stays where it is.
         near = variant.scalar is wp.float32 and not variant.reverse
@@ -67,7 +70,8 @@ class Arrays(DeclaredArrays):
             **contact.sizes(scene),
         }
         dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "pin")}
-        dims |= {"applied": sizes["applied"], "obstacles": sizes["obstacle"], "node_obstacles": sizes["node obstacle"]}
+        dims |= {"applied": sizes["applied"], "obstacles": sizes["obstacle"], "samples": sizes["sample"]}
+        dims["sample_obstacles"] = sizes["sample"] * sizes["obstacle"]
         super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)

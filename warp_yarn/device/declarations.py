@@ -2,10 +2,7 @@
 
 Arrays are made from these declarations (``arrays.py``), and no other name can be set or launched with. A test holds
 every argument of every kernel to them (``tests/kernels/test_declarations.py``). A group is what is made together.
-
-One **world** is one independent simulation of a batch. Today there is one; what steers it (status, step length,
-tolerances, counters) is an array over worlds all the same.
-
+One **world** is one independent simulation of a batch, today the only one: what steers it is an array over worlds.
 The field ``when`` names a condition of the scene (``fields.conditions``). Where it does not hold the name is None.
 """
 
@@ -302,6 +299,7 @@ LAUNCH: Group = {
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),
     "share": Field("launch", 1, "scalar", "", "always", "of a stage in what a step makes"),
     "step_duration": Field("launch", 1, "scalar", "s", "always", "h of a whole step"),
+    "is_last": Field("launch", 1, "int", "", "always", "whether what is in the way is a failure"),
     "moves": Field("launch", 1, "int", "", "always", "whether to look at where a step would lead"),
     "grid": Field("launch", 1, "uint64", "", "always", "Warp's hash grid"),
     "gaps": Field("launch", 1, "vec4", "1, m", "always", "(n, g) of what is near"),

@@ -72,8 +72,12 @@ class EnergyWatch:
         """Adds up the energy of the terms that are watched at every step, or of the others."""
         for term in self.model.arrays.terms:
             if term.energy is not None and bool(term.energy_watched_as) == cheap and term not in self._outer:
-                energy = self.model.arrays[term.energy_watched_as or "energy"]
-                self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
+                self.add(term, self.model.arrays[term.energy_watched_as or "energy"])
+
+    def add(self, term: Term, energy: wp.array) -> None:
+        """Adds a term's energy at the present state."""
+        arrays = self.model.contact.samples.of("position") if term.touches else {}
+        self.model.launch(f"{term.name}_energy", term.elements, energy=energy, **arrays)
 
     def begin_work(self) -> None:
         """Begins to add up the work done in a step."""

@@ -53,7 +53,10 @@ class Inspection:
                 a.zero("force", "euler_force", "friction_force_out")
                 if term.reads_forces:
                     a["euler_force"].assign(total)
+                self.model.contact.samples.clear(matrix=False)
                 self.model.launch_term(term, matrix=0, add_contact_load=0)
+                if term.touches:
+                    self.model.contact.samples.scatter(matrix=False)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"
                 along = np.zeros(2 * cloth.nodes)
                 if a[out] is not None:
@@ -94,18 +97,10 @@ class Inspection:
             if contact.obstacles:
                 found.append(contact.near_obstacles())
             if contact.has_mesh:
-                found.append(self._with_room(contact.near_faces))
+                found.append(contact.near_faces())
             if contact.self_contact:
-                found.append(self._with_room(contact.near_pairs))
-        return contacts_of(found, position)
-
-    def _with_room(self, report: Callable[[], Near]) -> Near:
-        """Reports what is near, with room for all of it."""
-        found = report()
-        while int(self.model.arrays["status"].numpy()[0]) == CROWDED:
-            self.stepper.make_room()
-            found = report()
-        return found
+                found.append(contact.near_pairs())
+        return contacts_of(found, contact.samples.places(position), contact.samples.ends)
 
     @alone
     def check_clear(self, state: State | None = None) -> None:
@@ -120,13 +115,13 @@ class Inspection:
         if not contact.on:
             return
         with Visit(self.stepper, state):
-            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
+            found = [contact.near_pairs()] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move
             where_known = state is None or not contact.obstacles_move
             if where_known and contact.obstacles:
                 found.append(contact.near_obstacles())
             if where_known and contact.has_mesh:
-                found.append(self._with_room(contact.near_faces))
+                found.append(contact.near_faces())
         for near in found:
             if len(near.gap):
                 gap, least, words = self._nearest(near)
@@ -139,12 +134,14 @@ class Inspection:
         has them; or ""."""
         contact = self.model.contact
         with Visit(self.stepper, None, ahead=True):
-            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
+            found = [contact.near_pairs()] if contact.self_contact else []
             found += [contact.near_obstacles()] if contact.obstacles else []
-            found += [self._with_room(contact.near_faces)] if contact.has_mesh else []
+            found += [contact.near_faces()] if contact.has_mesh else []
         told = []
         for near in found:
-            mine = (near.node == node) | (near.other == node)
+            ends = contact.samples.ends
+            its = (near.other >= 0) & (ends[near.other] == node).any(axis=1)
+            mine = (ends[near.sample] == node).any(axis=1) | its
             if mine.any():
                 gap, least, words = self._nearest(Near(*(values[mine] for values in near)))
                 told.append((gap - least, words))
@@ -152,16 +149,16 @@ class Inspection:
 
     def _nearest(self, near: Near) -> tuple[float, float, str]:
         """Finds the two that are nearest: how near, how near they may be, and that in words."""
-        place = self.model.scene.cloth.place
+        name_of = self.model.contact.samples.name
         k = int(near.gap.argmin())
-        node, other, obstacle = int(near.node[k]), int(near.other[k]), int(near.obstacle[k])
+        sample, other, obstacle = int(near.sample[k]), int(near.other[k]), int(near.obstacle[k])
         of_pair = other >= 0
         name = "self_contact_distance" if of_pair else "contact_distance"
         least = float(self.model.arrays[name].numpy()[0])
         kind = "" if of_pair else type(self.model.scene.obstacles[obstacle]).__name__
-        it = f"node {other} ({place(other)})" if of_pair else f"obstacles[{obstacle}], a {kind}"
+        it = name_of(other) if of_pair else f"obstacles[{obstacle}], a {kind}"
         words = (
-            f"node {node} ({place(node)}) is {near.gap[k]:.3g} m from {it}: must be above the contact's "
+            f"{name_of(sample)} is {near.gap[k]:.3g} m from {it}: must be above the contact's "
             f"{'self_distance' if of_pair else 'distance'}, {least:.3g} m"
         )
         return float(near.gap[k]), least, words
@@ -176,7 +173,7 @@ class Inspection:
             for term in a.terms:
                 if term.energy is not None:
                     energy.zero_()
-                    self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
+                    self.model.energy.add(term, energy)
                     # what touches is told as one
                     name = "contact" if term.touches else term.name
                     result[name] = result.get(name, 0.0) + float(energy.numpy()[0])
@@ -194,20 +191,19 @@ class Inspection:
         with Visit(self.stepper, state, ahead=True):
             self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
-            self.model.assemble()
+            with_room(self.stepper, self.model.assemble)
             return read_system(self.model)
 
 
-def make_room_where_crowded(stepper: Stepper) -> bool:
-    """Makes room for all that is near at the present positions, which no step may have come to; tells whether it had
-    to."""
-    contact, made = stepper.model.contact, False
-    if contact.self_contact or contact.has_mesh:
-        contact.find()
-        while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
-            stepper.make_room()
-            contact.find()
-            made = True
+def with_room(stepper: Stepper, look: Callable[[], None]) -> bool:
+    """Does what looks for what touches at the present positions, which no step may have come to, and makes room until
+    there is enough for it; tells whether it had to."""
+    look()
+    made = False
+    while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
+        stepper.make_room()
+        look()
+        made = True
     return made
 
 
@@ -259,7 +255,7 @@ class Visit:
             model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
-        make_room_where_crowded(stepper)
+        with_room(stepper, model.contact.find)
 
     def __exit__(self, *_: object) -> None:
         self.stepper.pay()

@@ -17,7 +17,7 @@ from ..device.declarations import FRAMES
 from ..device.model import Model
 from ..errors import InputError, WarpYarnWarning
 from ..integrators.made import Made, Point
-from .inspection import Visit, make_room_where_crowded
+from .inspection import Visit, with_room
 from .state import State, Trajectory
 from .stepper import LEDGER, Stepper
 
@@ -155,7 +155,7 @@ class Steps:
             if a[of_s] is not None and (of_s != "euler" or self.model.scene.sliding):
                 a[of_s].assign(values[:, 3:].ravel())
         self.model.inputs.load(stage)
-        make_room_where_crowded(self.stepper)
+        with_room(self.stepper, self.model.contact.find)
 
 
 def _point(state: State) -> Point:
@@ -189,7 +189,7 @@ def remade(stepper: Stepper, *, gained: bool, size: float) -> list[Part]:
     a.put("status", 0, 0, 0)
     parts.next_size, parts.watcher = size, look
     try:
-        made = parts.make(lambda: a.put("counters", frame, row), gained=gained)
+        made = parts.make(lambda: a.put("counters", frame, row), stepper.make_room, gained=gained)
     finally:
         parts.counts, parts.watcher = counts, watcher
         a.put("status", 0, 0, 0)

@@ -17,7 +17,7 @@ from ..errors import InputError, SimulationError, integer, real
 from ..integrators.implicit_euler import ImplicitEuler
 from ..integrators.made import held
 from ..kernels.core.status import CROWDED
-from .inspection import make_room_where_crowded
+from .inspection import with_room
 from .reactions import rounding_force
 from .state import FIELDS, State
 from .stepper import Stepper
@@ -159,7 +159,7 @@ class Relaxation:
         """Computes the forces on the cloth at rest, along x and (u, v) [nodes, 5] (N)."""
         a, nodes = self.arrays, self.model.scene.cloth.nodes
         self.model.inputs.load()
-        if make_room_where_crowded(self.stepper):
+        if with_room(self.stepper, self.model.contact.find):
             self.method.forget_graphs()
         self.model.assemble(matrix=False)
         result = np.zeros((nodes, 5))

@@ -228,7 +228,7 @@ class Stepper:
             self.frames.restore(frame)
             self.arrays.put("status", 0, 0, 0)
             parts.next_size = 1.0 if gained else 0.5
-        smallest = parts.make(lambda: self._count(frame), gained=gained)
+        smallest = parts.make(lambda: self._count(frame), self.make_room, gained=gained)
         self.integrator.set_times(self.model.step_size, self.model.step_size)
         if not smallest:
             return False
