@@ -9,7 +9,6 @@ Unknowns stand in one vector, as in ``Simulator.system``: q = (x of every node, 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 
@@ -54,10 +53,10 @@ def unit(d: Tensor) -> Tensor:
     return d / torch.linalg.vector_norm(d)
 
 
-def stretch(q: Tensor, k: Tensor) -> Tensor:
-    """q = (x_a, x_b, s_a, s_b)."""
+def stretch(q: Tensor, k: Tensor, longer: Tensor) -> Tensor:
+    """q = (x_a, x_b, s_a, s_b); longer: the yarn's length over the distance that it covers, as woven."""
     rest = q[7] - q[6]
-    return 0.5 * k * rest * (torch.linalg.vector_norm((q[3:6] - q[0:3]) / rest) - 1.0) ** 2
+    return 0.5 * k * rest * (longer * torch.linalg.vector_norm((q[3:6] - q[0:3]) / rest) - 1.0) ** 2
 
 
 def kinetic(q: Tensor, v: Tensor, density: Tensor) -> Tensor:
@@ -72,10 +71,10 @@ def gravity(q: Tensor, density: Tensor, g: Tensor) -> Tensor:
     return -density * (q[7] - q[6]) * (g @ (q[0:3] + q[3:6])) / 2.0
 
 
-def parallel(q: Tensor, k: Tensor, distance: Tensor, guard: Tensor, reach: float) -> Tensor:
+def parallel(q: Tensor, k: Tensor, distance: Tensor, guard: Tensor, reach: Tensor) -> Tensor:
     """q = (s_a, s_b); guard: the barrier's stiffness [N]."""
     rest = q[1] - q[0]
-    near = torch.clamp(rest, max=reach)
+    near = torch.minimum(rest, reach)
     return 0.5 * k * torch.relu(distance - rest) ** 2 - guard / reach * (near - reach) ** 2 * torch.log(near / reach)
 
 
@@ -101,39 +100,38 @@ def angle_squared(t1: Tensor, t2: Tensor) -> Tensor:
     return torch.where(near, series, apart**2)
 
 
-def presence(d: Tensor, spacing: float) -> Tensor:
+def presence(d: Tensor, spacing: Tensor | float) -> Tensor:
     """1 for a segment d of a tenth of the spacing or more, 0 for one of no length: 6x⁵ − 15x⁴ + 10x³."""
     x = torch.clamp(torch.linalg.vector_norm(d) / (0.1 * spacing), max=1.0)
     return 6.0 * x**5 - 15.0 * x**4 + 10.0 * x**3
 
 
-def faded(energy: Tensor, largest: Tensor, e1: Tensor, e2: Tensor, spacing: float) -> Tensor:
-    """An energy of the angle between two segments."""
-    part = presence(e1, spacing) * presence(e2, spacing)
+def faded(energy: Tensor, largest: Tensor, e1: Tensor, e2: Tensor, l1: Tensor, l2: Tensor) -> Tensor:
+    """An energy of the angle between two segments, and their distances at rest."""
+    part = presence(e1, l1) * presence(e2, l2)
     return part * energy + (1.0 - part) * largest
 
 
-def bending(q: Tensor, k: Tensor, spacing: float) -> Tensor:
-    """q = (x_a, x_c, x_b, s_a, s_b)."""
+def bending(q: Tensor, k: Tensor, l1: Tensor, l2: Tensor) -> Tensor:
+    """q = (x_a, x_c, x_b, s_a, s_b); l1 of c to b, l2 of a to c."""
     e1, e2 = q[6:9] - q[3:6], q[0:3] - q[3:6]
-    return faded(k * angle_squared(unit(e1), -unit(e2)), k * math.pi**2, e1, e2, spacing) / (q[10] - q[9])
+    return faded(k * angle_squared(unit(e1), -unit(e2)), k * math.pi**2, e1, e2, l1, l2) / (q[10] - q[9])
 
 
-def lock(phi: Tensor, spacing: float, radius: float) -> Tensor:
-    """Eq. 5, with c = 3 and σ = 0.6, and γ = 0 beyond the right angle."""
-    threshold = 2.0 * math.asin(radius / spacing)
-    gamma = torch.relu((math.sqrt(2.0) * spacing - 2.0 * spacing * torch.sin(phi / 2.0)) / radius)
+def lock(phi: Tensor, threshold: Tensor | float, ratio: Tensor | float) -> Tensor:
+    """Eq. 5, with c = 3 and σ = 0.6, and γ = 0 beyond the right angle; threshold φ_l, ratio L/R."""
+    gamma = torch.relu((math.sqrt(2.0) - 2.0 * torch.sin(phi / 2.0)) * ratio)
     denominator = (phi * (phi - threshold) * (phi - RIGHT)) ** 2 + RIGHT**4 * 0.6**2
     return 0.5 * ((1.0 + gamma**3) + (1.0 - gamma**3) * torch.tanh(RIGHT**5 * (phi - threshold) / denominator))
 
 
-def shear(q: Tensor, k: Tensor, jams: Tensor, spacing: float, radius: float) -> Tensor:
-    """q = (x_p, x_c, x_r); k = S π R² (1 + F_n) L."""
+def shear(q: Tensor, k: Tensor, jams: Tensor, l1: Tensor, l2: Tensor, threshold: Tensor, ratio: Tensor) -> Tensor:
+    """q = (x_p, x_c, x_r); k = S π R² (1 + F_n) L; l1 of c to p, l2 of c to r."""
     e1, e2 = q[0:3] - q[3:6], q[6:9] - q[3:6]
     phi = angle(unit(e1), unit(e2))
-    factor = torch.where(jams, lock(phi, spacing, radius), tensor(1.0))
-    largest = 0.5 * k * RIGHT**2 * torch.where(jams, lock(tensor(0.0), spacing, radius), tensor(1.0))
-    return faded(0.5 * k * factor * (phi - RIGHT) ** 2, largest, e1, e2, spacing)
+    factor = torch.where(jams, lock(phi, threshold, ratio), tensor(1.0))
+    largest = 0.5 * k * RIGHT**2 * torch.where(jams, lock(tensor(0.0), threshold, ratio), tensor(1.0))
+    return faded(0.5 * k * factor * (phi - RIGHT) ** 2, largest, e1, e2, l1, l2)
 
 
 def wind(q: Tensor, v: Tensor, velocity: Tensor, density: float, drag: float) -> Tensor:
@@ -199,12 +197,55 @@ class Oracle:
         # Yarns alternate, in both directions.
         self.warp = [cloth.yarns[j % len(cloth.yarns)] for j in range(self.rows)]
         self.weft = [cloth.yarns[i % len(cloth.yarns)] for i in range(self.columns)]
-        self.area = math.pi * cloth.radius**2
+        # distances between weft yarns, along u, and between warp yarns, along v; and by how much yarns are longer
+        warp, weft = cloth.spacing if isinstance(cloth.spacing, tuple) else (cloth.spacing, cloth.spacing)
+        self.along = (self.each(weft, self.columns - 1), self.each(warp, self.rows - 1))
+        warp, weft = cloth.crimp if isinstance(cloth.crimp, tuple) else (cloth.crimp, cloth.crimp)
+        self.crimp = (self.each(warp, self.rows), self.each(weft, self.columns))
         self.slides = torch.zeros(self.rows, self.columns, 2, dtype=torch.float64)
         if scene.sliding:
             self.slides[1:-1, 1:-1] = 1.0
         self.slides = self.slides.ravel()
         self._build()
+
+    # -- numbers of the cloth
+
+    @staticmethod
+    def each(value: object, count: int) -> list[float]:
+        return [float(value)] * count if isinstance(value, float) else [float(each) for each in value]
+
+    def halves(self, yarn: wy.Yarn) -> tuple[float, float]:
+        """Half the width and half the thickness."""
+        if yarn.width is not None:
+            return yarn.width / 2.0, yarn.thickness / 2.0
+        return (yarn.radius or self.cloth.radius,) * 2
+
+    def area(self, yarn: wy.Yarn) -> float:
+        """Of the section."""
+        return math.pi * math.prod(self.halves(yarn))
+
+    def distance(self, a: tuple[int, int], b: tuple[int, int]) -> float:
+        """Of neighbouring crossings (j, i) at rest."""
+        return self.along[0][min(a[1], b[1])] if a[0] == b[0] else self.along[1][min(a[0], b[0])]
+
+    def longer(self, where: tuple[int, int], direction: int) -> float:
+        """Length of the yarn through a crossing over the distance that it covers."""
+        return 1.0 + self.crimp[direction][where[direction]]
+
+    def half_width_across(self, where: tuple[int, int], direction: int) -> float:
+        """Of the yarn that crosses one of this direction."""
+        j, i = where
+        return self.halves((self.weft[i], self.warp[j])[direction])[0]
+
+    def of_nodes(self, name: str) -> Tensor:
+        """A number of crossings, of every node."""
+        value = getattr(self.cloth, name)
+        if isinstance(value, float):
+            return torch.full((self.nodes,), value, dtype=torch.float64)
+        if value.ndim == 1:
+            return tensor(value.copy())
+        kinds = len(self.cloth.yarns)
+        return tensor([[value[j % kinds][i % kinds] for i in range(self.columns)] for j in range(self.rows)]).ravel()
 
     # -- where things are
 
@@ -249,6 +290,10 @@ class Oracle:
                 result += [(a, b, d), (a, d, c)] if (i + j) % 2 == 0 else [(a, b, c), (b, d, c)]
         return result
 
+    def total_mass(self) -> float:
+        """Of all yarns: density times length."""
+        return sum(yarn.density * self.distance(a, b) * self.longer(a, k) for (a, b), k, yarn in self.chains(2))
+
     # -- energies
 
     def _segments(self, local: Callable[..., Tensor], *parameters: list) -> Elements:
@@ -262,28 +307,32 @@ class Oracle:
         """All elements at once: a tensor that is first made inside a transform of torch.func cannot be kept."""
         scene, cloth = self.scene, self.cloth
         yarns = [yarn for *_, yarn in self.chains(2)]
-        self.stretch = self._segments(stretch, [yarn.stretch * self.area for yarn in yarns])
+        longer = [self.longer(a, direction) for (a, _), direction, _ in self.chains(2)]
+        self.stretch = self._segments(stretch, [yarn.stretch * self.area(yarn) for yarn in yarns], longer)
         self.inertial = self._segments(kinetic, [yarn.density for yarn in yarns])
         self.gravity = self._segments(gravity, [yarn.density for yarn in yarns], [scene.gravity.tolist()] * len(yarns))
 
-        unknowns, distance, guard = [], [], []
-        k = cloth.parallel_stiffness * cloth.spacing
+        unknowns, k, distance, guard, reach = [], [], [], [], []
         for (a, b), direction, yarn in self.chains(2):
             unknowns.append([self.slide(self.node(*a), direction), self.slide(self.node(*b), direction)])
             against = self.flipped[a[0]][a[1]] != self.flipped[b[0]][b[1]]
-            distance.append((4.0 if against else 2.0) * cloth.radius)
-            guard.append(k + yarn.stretch * self.area)
-        local = functools.partial(parallel, reach=0.2 * cloth.radius)
-        parameters = (tensor([k] * len(unknowns)), tensor(distance), tensor(guard))
-        self.parallel = Elements(torch.tensor(unknowns), local, parameters)
+            across = self.half_width_across(a, direction) + self.half_width_across(b, direction)
+            through = 2.0 * self.halves(yarn)[1] if against else 0.0
+            distance.append((across + through) * self.longer(a, direction))
+            k.append(cloth.parallel_stiffness * self.distance(a, b))
+            guard.append(k[-1] + yarn.stretch * self.area(yarn))
+            reach.append(0.1 * across * self.longer(a, direction))
+        parameters = (tensor(k), tensor(distance), tensor(guard), tensor(reach))
+        self.parallel = Elements(torch.tensor(unknowns), parallel, parameters)
 
-        unknowns, k = [], []
+        unknowns, k, l1, l2 = [], [], [], []
         for (a, c, b), direction, yarn in self.chains(3):
+            l1.append(self.distance(c, b))
+            l2.append(self.distance(a, c))
             a, c, b = self.node(*a), self.node(*c), self.node(*b)
             unknowns.append([*self.unknowns(a, c, b), self.slide(a, direction), self.slide(b, direction)])
-            k.append(yarn.bend * self.area)
-        local = functools.partial(bending, spacing=cloth.spacing)
-        self.bending = Elements(torch.tensor(unknowns), local, (tensor(k),))
+            k.append(yarn.bend * self.area(yarn))
+        self.bending = Elements(torch.tensor(unknowns), bending, (tensor(k), tensor(l1), tensor(l2)))
 
         nodes = [int(node) for node in scene.pins]
         k = tensor([scene.pin_stiffness] * len(nodes))
@@ -293,16 +342,24 @@ class Oracle:
 
     def shear(self, contact_force: Tensor) -> Elements:
         """F_n of every node is held."""
-        unknowns, jams, crossing = [], [], []
+        unknowns, jams, crossing, area, l1, l2, threshold = [], [], [], [], [], [], []
         for corner in self.corners():
             p, c, r = (self.flipped[j][i] for j, i in corner)
             nodes = [self.node(*where) for where in corner]
             unknowns.append(self.unknowns(*nodes))
             jams.append(c != p and c != r)
             crossing.append(nodes[1])
-        k = self.cloth.shear * self.area * self.cloth.spacing * (1.0 + contact_force[crossing])
-        local = functools.partial(shear, spacing=self.cloth.spacing, radius=self.cloth.radius)
-        return Elements(torch.tensor(unknowns), local, (k, torch.tensor(jams)))
+            area.append(math.pi * self.half_width_across(corner[1], 0) * self.half_width_across(corner[1], 1))
+            # the weft yarns at the crossing and at p are as far apart as these, the warp yarns as it and r
+            l1.append(self.distance(corner[0], corner[1]))
+            l2.append(self.distance(corner[1], corner[2]))
+            wefts = [self.half_width_across(where, 0) for where in corner[:2]]
+            warps = [self.half_width_across(where, 1) for where in corner[1:]]
+            threshold.append(math.asin(sum(wefts) / 2.0 / l1[-1]) + math.asin(sum(warps) / 2.0 / l2[-1]))
+        l1, l2, threshold = tensor(l1), tensor(l2), tensor(threshold)
+        k = self.of_nodes("shear")[crossing] * tensor(area) * (l1 + l2) / 2.0 * (1.0 + contact_force[crossing])
+        parameters = (k, torch.tensor(jams), l1, l2, threshold, 1.0 / torch.sin(threshold / 2.0))
+        return Elements(torch.tensor(unknowns), shear, parameters)
 
     def elements(self, term: str, q: Tensor) -> Elements:
         """Of a conservative term; the contact force is that of q."""
@@ -347,7 +404,10 @@ class Oracle:
                 continue
             for direction, sign in ((0, 1.0), (1, -1.0)):
                 yarns = getattr(self, term).of([d == direction for _, d, _ in self.chains(length)])
-                crimp = -sign * self.cloth.radius * normal if term == "bending" else torch.zeros_like(x)
+                yarn = (self.warp, self.weft)[direction]
+                grid = [(j, i) for j in range(self.rows) for i in range(self.columns)]
+                half = tensor([self.halves(yarn[where[direction]])[1] for where in grid])
+                crimp = -sign * half[:, None] * normal if term == "bending" else torch.zeros_like(x)
                 moved = torch.cat([(x + crimp).ravel(), q[3 * self.nodes :]])
                 force = yarns.force(moved)[: 3 * self.nodes].reshape(self.nodes, 3)
                 load = load + 0.5 * sign * torch.sum(normal * force, dim=1)
@@ -386,16 +446,18 @@ class Oracle:
         others = sum(self.force(t, q, v, anchor) for t in self.scene.terms if t not in ("mass", "friction"))
         others = others[3 * self.nodes :] if isinstance(others, Tensor) else torch.zeros_like(anchor)
         delta = q[3 * self.nodes :] - anchor
-        limit = self.cloth.friction * self.contact(q)[1].repeat_interleave(2)
+        limit = (self.of_nodes("friction") * self.contact(q)[1]).repeat_interleave(2)
         spring = self.spring(delta, others, limit)
-        f = spring - self.cloth.friction_damping * v[3 * self.nodes :]
+        f = spring - self.of_nodes("friction_damping").repeat_interleave(2) * v[3 * self.nodes :]
         return torch.cat([torch.zeros_like(q[: 3 * self.nodes]), f])
 
     def spring(self, delta: Tensor, others: Tensor, limit: Tensor) -> Tensor:
         """Eq. 4 without damping; limit = μF_n."""
-        k, p = self.cloth.friction_stiffness, self.cloth.friction_sharpness
-        # The floor under μF_n: the spring's force at 1e-7 spacings.
-        scale = torch.ones_like(limit) if self.scene.published_scaling else limit + k * self.cloth.spacing * 1e-7
+        k, p = self.of_nodes("friction_stiffness").repeat_interleave(2), self.cloth.friction_sharpness
+        # The floor under μF_n: the spring's force at 1e-7 spacings, to the next crossing of the warp yarn.
+        spacing = tensor([self.along[0][min(i, self.columns - 2)] for i in range(self.columns)])
+        floor = k * spacing.repeat(self.rows).repeat_interleave(2) * 1e-7
+        scale = torch.ones_like(limit) if self.scene.published_scaling else limit + floor
         per_length = 1.0 if self.scene.published_scaling else k
         sign = torch.tanh(p * delta * per_length / scale)
         stuck = torch.tanh(p * (limit - torch.abs(others)) / scale)

@@ -401,7 +401,7 @@ def test_rings_do_not_twist():
     """From ring to ring, and at a yarn's first ring from frame to frame, no vector turns by more than the yarn does."""
     trajectory = waving(frames=20)
     for part in geometry.strands(trajectory):
-        tubes = geometry.Tubes.around(part, RADIUS, sides=8, samples=4)
+        tubes = geometry.Tubes.around(part, sides=8, samples=4)
         _, _, tangents = part.sampled(4)
         across = tubes.across
         first = tubes.counts.cumsum() - tubes.counts
@@ -423,7 +423,7 @@ def test_rings_of_a_yarn_in_a_plane_keep_their_angle_to_it():
     trajectory.position[0] = trajectory.cloth.position @ turn.T
     warp, weft = geometry.strands(trajectory)
     for part, normal in ((warp, turn[:, 1]), (weft, turn[:, 0])):
-        tubes = geometry.Tubes.around(part, RADIUS, sides=8, samples=4)
+        tubes = geometry.Tubes.around(part, sides=8, samples=4)
         for across in np.split(tubes.across[0], tubes.counts.cumsum()[:-1]):
             cosines = across @ normal
             assert 0.05 < np.abs(cosines[0, 0]) < 0.999

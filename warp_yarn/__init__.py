@@ -5,11 +5,12 @@ import importlib.metadata
 from types import ModuleType
 
 from . import moved
-from .description.cloth import Cloth, Yarn
+from .description.cloth import Cloth
 from .description.cloths import Cloths
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
+from .description.yarn import Yarn
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, real
-from .cloth import Fixed
+from .fixed import Fixed
 
 ROUNDING = 1e-15
 """Of a length of 1: what was normalized stays as it is, to the last bit."""

@@ -11,8 +11,9 @@ import numpy as np
 
 from ..errors import InputError, choice, finite_array, indices, real
 from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
-from .cloth import Cloth, Fixed
+from .cloth import Cloth
 from .cloths import Cloths, as_one
+from .fixed import Fixed
 from .obstacles import Contact, Obstacle
 
 

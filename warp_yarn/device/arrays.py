@@ -14,6 +14,7 @@ from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
+from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
@@ -49,6 +50,7 @@ class Arrays(DeclaredArrays):
         sizes = {
             "world": 1,
             "cloth": 1,
+            **_number_sizes(scene.cloth, variant.general),
             "node": topology.nodes,
             "block": self.stencil * topology.nodes,
             "yarn": len(topology.yarn_direction),
@@ -75,7 +77,9 @@ class Arrays(DeclaredArrays):
         """Compute the mean mass of a node [kg]."""
         cloth = self.scene.cloth
         density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
-        return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
+        if not cloth.general:
+            return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
+        return cloth.mass / cloth.nodes
 
     def _indices(self, name: str, values: np.ndarray) -> None:
         """Set an index array, or None where the scene has no use for it."""
@@ -94,6 +98,7 @@ class Arrays(DeclaredArrays):
             "segments": np.column_stack([topology.segment_nodes, yarn, topology.yarn_direction[yarn]]),
             "neighbour": topology.neighbour[:, : self.stencil].ravel(),
             "is_free": free,
+            "node_yarns": cloth.node_yarns.ravel() if "general" in self.conditions else None,
         }
         counts = {"nodes": topology.nodes, "columns": cloth.columns, "stencil": self.stencil}
         for name in declarations.TOPOLOGY:
@@ -106,9 +111,7 @@ class Arrays(DeclaredArrays):
         cloth = scene.cloth
         for name in YARN_PARAMETERS:
             self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
-        for name in CLOTH_NUMBERS:
-            self[name] = self.numbers(getattr(cloth, name))
-        self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
+        self._cloth_numbers(cloth)
         if scene.gravity is not None:
             self["gravity"] = self.numbers(scene.gravity[None])
         if scene.wind is not None:
@@ -137,6 +140,22 @@ class Arrays(DeclaredArrays):
             self.declare(name, Field(element, 1, kind, parameter.unit, "always", "of a term from outside the package"))
             value = scene.registered_value(name)
             self[name] = self.numbers(value[cloth.material] if parameter.of == "yarn" else value[None])
+
+    def _cloth_numbers(self, cloth: Cloth | Cloths) -> None:
+        """Fill what a cloth says in numbers: single ones, or in a general cloth those of every segment, yarn, ..."""
+        general = "general" in self.conditions
+        for name in CLOTH_NUMBERS:
+            if general and name in OF_CROSSINGS:
+                self[name] = self.numbers(cloth.at_nodes(name))
+            elif not general or name not in ("spacing", "radius"):
+                self[name] = self.numbers(getattr(cloth, name))
+        if general:
+            self["spacing"] = self.numbers(cloth.node_spacing.ravel())
+            self["radius"] = self.numbers(cloth.halves.ravel())
+            self["lock_angle"] = self.numbers(cloth.corner_lock.ravel())
+        else:
+            self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
+        self["lengthening"] = self.numbers(1.0 + cloth.yarn_crimp) if general else None
 
     def add_frames(self, count: int) -> None:
         """Make room for so many frames of what moves, as ``frame_position`` and so on."""
@@ -183,3 +202,15 @@ class Arrays(DeclaredArrays):
         self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
         self.dims["coarse_warp_lines"] = found.coarse_warp_lines
         self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
+
+
+def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:
+    """Count what the numbers of a cloth are of: one of each in a plain cloth."""
+    topology = cloth.topology
+    counts = {
+        "gap": 2 * topology.nodes,
+        "half": 2 * len(topology.yarn_direction),
+        "corner": 4 * len(topology.crossing_node),
+        "cloth crossing": topology.nodes,
+    }
+    return counts if general else dict.fromkeys(counts, 1)

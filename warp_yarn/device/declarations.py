@@ -30,6 +30,7 @@ TOPOLOGY: Group = {
     "is_crossing": Field("node", 1, "int", "", "always", "1 at a crossing, 0 on the border"),
     "is_free": Field("node", 1, "int", "", "always", "0 where a hard pin holds a node, else 1"),
     "flipped": Field("node", 1, "int", "", "always", "the draft: which yarn is on top"),
+    "node_yarns": Field("node", 2, "int", "", "general", "its warp yarn and its weft yarn, or -1"),
     "neighbour": Field("block", 1, "int", "", "always", "upper neighbours of a node in the matrix, or -1"),
 }
 """Index arrays (``description/topology.py``)."""
@@ -38,18 +39,21 @@ PARAMETERS: Group = {
     "density": Field("yarn", 1, "scalar", "kg/m", "always", "ρ"),
     "stretch": Field("yarn", 1, "scalar", "Pa", "always", "stretch modulus Y"),
     "bend": Field("yarn", 1, "scalar", "Pa m²", "always", "bending modulus B"),
-    "spacing": Field("cloth", 1, "scalar", "m", "always", "L"),
-    "radius": Field("cloth", 1, "scalar", "m", "always", "R"),
-    "shear": Field("cloth", 1, "scalar", "Pa", "always", "shear modulus S"),
-    "friction": Field("cloth", 1, "scalar", "", "always", "μ"),
-    "friction_stiffness": Field("cloth", 1, "scalar", "N/m", "always", "k_f"),
-    "friction_damping": Field("cloth", 1, "scalar", "N s/m", "always", "d_f"),
+    "spacing": Field("gap", 1, "scalar", "m", "always", "L"),
+    "radius": Field("half", 1, "scalar", "m", "always", "R; of each yarn half the width and half the thickness"),
+    "lengthening": Field("yarn", 1, "scalar", "", "general", "1 + crimp: length over the distance that it covers"),
+    "shear": Field("cloth crossing", 1, "scalar", "Pa", "always", "shear modulus S"),
+    "friction": Field("cloth crossing", 1, "scalar", "", "always", "μ"),
+    "friction_stiffness": Field("cloth crossing", 1, "scalar", "N/m", "always", "k_f"),
+    "friction_damping": Field("cloth crossing", 1, "scalar", "N s/m", "always", "d_f"),
     "friction_sharpness": Field("cloth", 1, "scalar", "", "always", "p of the law's tanh"),
     "parallel_stiffness": Field("cloth", 1, "scalar", "N/m", "always", "k_c"),
-    "lock_angle": Field("cloth", 1, "scalar", "rad", "always", "φ_l = 2 arcsin(R/L)"),
+    "lock_angle": Field("corner", 1, "scalar", "rad", "always", "φ_l = 2 arcsin(R/L)"),
     "published_scaling": Field("count", 1, "int", "", "always", "1: friction with arguments in SI units, as published"),
 }
-"""What a scene says of its yarns and its cloth."""
+"""What a scene says of its yarns and its cloth. A plain cloth has one gap, half, corner and cloth crossing; a general
+one (``kernels/core/general.py``) two gaps of each node, two halves of each yarn, four corners of each crossing, and as
+many cloth crossings as nodes."""
 
 INPUTS: Group = {
     "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g"),

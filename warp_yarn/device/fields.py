@@ -48,6 +48,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
     holds = {
         "always": True,
         "sliding": variant.sliding,
+        "general": variant.general,
         "contact": any(term.needs_contact for term in terms),
         "friction": "friction" in names,
         "shear": "shear" in names or others,

@@ -87,7 +87,7 @@ class ImpactZones:
 
     def __init__(self, model: Model):
         self.model, scene = model, model.scene
-        self.thickness: float = scene.contact.thickness or THICKNESS * scene.cloth.spacing
+        self.thickness: float = scene.contact.thickness or THICKNESS * scene.cloth.shortest_spacing
         self.detection, self._obstacle = detection_of(scene, model.device)
         self.made: dict[int, Projected] = {}
         self.rounds = 0

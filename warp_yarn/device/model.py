@@ -13,7 +13,8 @@ import warp as wp
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, integer, real
-from ..kernels import TERMS, Term, Variant, build
+from ..kernels import TERMS, Term, Variant, build, own
+from ..kernels.core.general import NUMBERS
 from . import defaults
 from .arrays import Arrays
 from .contact import Contact
@@ -83,7 +84,7 @@ class Model:
             max_iterations = defaults.max_iterations(scene)
         self.max_iterations = integer("max_iterations", max_iterations, least=1)
         self.device = _checked_device(device)
-        variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
+        variant = Variant(PRECISIONS[precision], scene.sliding, differentiable, general=scene.cloth.general)
         self.kernels = _kernels(scene, variant)
         self.arrays = Arrays(scene, variant, self.device)
         _check_inputs(self)
@@ -251,12 +252,16 @@ def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
 
 
 def _check_inputs(model: Model) -> None:
-    """Refuses a term that takes what acts on other cloths, and not on this one."""
+    """Refuses a term that takes what acts on other cloths, and not on this one, or one number of what has several."""
     for term in model.arrays.terms:
         for name in (term.name, f"{term.name}_energy"):
             taken = arguments(model.kernels[name]) if name in model.kernels else set()
             for lacking in sorted(taken & set(INPUTS) - set(model.arrays)):
                 raise InputError(f"scene.terms has {term.name!r}, which takes {lacking!r}: the scene has none")
+            for read in sorted(taken & NUMBERS) if model.arrays.variant.general and not own(term) else ():
+                raise InputError(
+                    f"scene.terms has {term.name!r}, which reads one {read!r} of the cloth: this one has several"
+                )
 
 
 def _factorize_levels(model: Model) -> None:

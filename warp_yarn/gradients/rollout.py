@@ -98,7 +98,7 @@ class Rollout:
         self._options = {**options, "device": str(self.simulator.model.device)}
         self._inputs = Inputs(self.simulator)
         self.dtype, self.device = self._inputs.dtype, self._inputs.device
-        self.of_yarns = self._inputs.of_yarns
+        self.of_yarns, self.of_crossings = self._inputs.of_yarns, self._inputs.of_crossings
         self._run = DeviceRun(self.simulator, self._inputs, self.steps, self.frames, self.checkpoint_every)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -120,6 +120,9 @@ class Rollout:
         """Everything that a call takes, and that a gradient can be asked for: name and shape.
 
         density, stretch and bend are of each material; with ``yarn_`` before them, of each yarn, the warp yarns first.
+        shear, friction, friction_stiffness and friction_damping have the cloth's own shapes: a number, one of each pair
+        of materials, or one of each node; where any number of the cloth is not the same everywhere, with ``node_``
+        before them, of each node, of which those on the border mean nothing.
         pin_path and forces have the shapes that the scene gave them. Nodes on the border have no Eulerian coordinate:
         their rows of euler_velocity are taken for 0.
         """

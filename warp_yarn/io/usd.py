@@ -113,7 +113,6 @@ def _write_stage(
     stage.SetEndTimeCode(len(trajectory) - 1)
     cloth = UsdGeom.Xform.Define(stage, "/cloth")
     stage.SetDefaultPrim(cloth.GetPrim())
-    radius = trajectory.cloth.radius
     origin = origins(trajectory)
     if origin.any():
         translate = cloth.AddTranslateOp()
@@ -125,10 +124,10 @@ def _write_stage(
     for part in parts:
         prim_path = cloth.GetPath().AppendChild(f"yarn_{part.material}")
         if tubes:
-            shape = Tubes.around(part, radius, sides=sides, samples=TUBE_SAMPLES)
+            shape = Tubes.around(part, sides=sides, samples=TUBE_SAMPLES)
             _write_mesh(UsdGeom.Mesh.Define(stage, prim_path), shape, part, origin)
         else:
-            _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, radius, origin)
+            _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, origin)
     if obstacles:
         UsdGeom.Scope.Define(stage, "/obstacles")
     for k, each in enumerate(obstacles):
@@ -178,7 +177,7 @@ def origins(trajectory: Trajectory) -> np.ndarray:
     move them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
     position = trajectory.position
     low, high = position.min(axis=1), position.max(axis=1)
-    reach = COARSE * trajectory.cloth.radius / np.finfo(np.float32).epsneg
+    reach = COARSE * float(trajectory.cloth.halves.min()) / np.finfo(np.float32).epsneg
     middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
     for origin in (np.zeros(3), middle):
         if max(np.abs(low - origin).max(), np.abs(high - origin).max()) <= reach:
@@ -186,7 +185,7 @@ def origins(trajectory: Trajectory) -> np.ndarray:
     return 0.5 * (low + high)
 
 
-def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, origin: np.ndarray) -> None:
+def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, origin: np.ndarray) -> None:
     from pxr import UsdGeom, Vt
 
     curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
@@ -194,12 +193,12 @@ def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, ori
     # Repeated end points instead of `pinned`, whose segments Storm miscounts.
     curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
     curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy((part.counts + 2).astype(np.int32)))
-    curves.CreateWidthsAttr([2.0 * radius])
+    curves.CreateWidthsAttr([2.0 * part.radius])
     curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
     _write_color(curves, part)
     repeated = part.repeated
     for frame, points in enumerate(part.points):
-        _write_points(curves, frame, points[repeated] - origin[frame], radius)
+        _write_points(curves, frame, points[repeated] - origin[frame], part.radius)
 
 
 def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndarray) -> None:

@@ -269,7 +269,7 @@ def _made(
     if step_error is not None:
         at_once.estimate_errors()
     fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](model)
-    substepping = Substepping(model, at_once, step_error and step_error * scene.cloth.spacing, fallback)
+    substepping = Substepping(model, at_once, step_error and step_error * scene.cloth.shortest_spacing, fallback)
     frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes))
     # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
     frames.upload(frames.rest())

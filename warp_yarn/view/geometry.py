@@ -1,6 +1,7 @@
 """What a trajectory looks like: every yarn a smooth curve over and under the others, and a tube around it.
 
-At a crossing a warp yarn passes at x − R n and a weft yarn at x + R n, n the contact normal from warp to weft. On the
+At a crossing a warp yarn passes at x − R n and a weft yarn at x + R n, n the contact normal from warp to weft, R half
+the yarn's thickness. On the
 border there is no normal and no offset. Between these points runs the Catmull-Rom spline through them.
 """
 
@@ -45,6 +46,8 @@ class Strands:
     """Index into the cloth's yarns."""
     color: tuple[float, float, float]
     """Red, green, blue from 0 to 1, sRGB."""
+    radius: float
+    """Half the yarns' thickness [m]."""
     counts: np.ndarray
     """[yarns]: points of each yarn."""
     points: np.ndarray
@@ -94,7 +97,7 @@ class Tubes:
     sides: int
 
     @classmethod
-    def around(cls, strands: Strands, radius: float, *, sides: int, samples: int) -> Tubes:
+    def around(cls, strands: Strands, *, sides: int, samples: int) -> Tubes:
         """Makes tubes with `samples` rings a segment; rings do not twist, along the yarn or from frame to frame."""
         counts, centres, tangents = strands.sampled(samples)
         start = counts.cumsum() - counts
@@ -109,7 +112,7 @@ class Tubes:
         for k in range(1, counts.max()):
             i = start[counts > k] + k
             first[:, i] = _transported(first[:, i - 1], tangents[:, i - 1], tangents[:, i])
-        return cls(centres, np.stack([first, np.cross(tangents, first)], axis=2), counts, radius, sides)
+        return cls(centres, np.stack([first, np.cross(tangents, first)], axis=2), counts, strands.radius, sides)
 
     def normals(self, frame: int) -> np.ndarray:
         """Finds unit vectors out of the yarn at every vertex of one frame [rings · sides, 3], ring after ring."""
@@ -242,7 +245,7 @@ def strands(trajectory: Trajectory) -> list[Strands]:
     """Lists the yarns of every material that the cloth uses, at every frame."""
     position = checked(trajectory)
     cloth, topology = trajectory.cloth, trajectory.cloth.topology
-    offset = cloth.radius * contact_normals(cloth, position)
+    normals = contact_normals(cloth, position)
     order = np.argsort(topology.segment_yarn, kind="stable")
     segments = topology.segment_nodes[order]
     starts = np.flatnonzero(np.diff(topology.segment_yarn[order], prepend=-1))
@@ -253,8 +256,9 @@ def strands(trajectory: Trajectory) -> list[Strands]:
         nodes = np.concatenate([yarns[y] for y in mine])
         counts = np.array([len(yarns[y]) for y in mine])
         side = np.repeat(2.0 * topology.yarn_direction[mine] - 1.0, counts)
-        points = position[:, nodes] + side[:, None] * offset[:, nodes]
-        result.append(Strands(k, cloth.yarns[k].color or PALETTE[k % len(PALETTE)], counts, points))
+        radius = float(cloth.halves[mine[0], 1])
+        points = position[:, nodes] + side[:, None] * (radius * normals[:, nodes])
+        result.append(Strands(k, cloth.yarns[k].color or PALETTE[k % len(PALETTE)], radius, counts, points))
     return result
 
 

@@ -134,14 +134,14 @@ class _Picture:
         self, trajectory: Trajectory, size: tuple[int, int], view: Sequence[float], at: np.ndarray | None = None
     ):
         parts = strands(trajectory)
-        radius = trajectory.cloth.radius
+        radius = trajectory.cloth.half_thickness
         self.obstacles = placed(trajectory, at)
         points = np.concatenate([part.points for part in parts], axis=1).reshape(-1, 3)
         around = [each.world(each.corners()).reshape(-1, 3) for each in self.obstacles]
         shown = [np.clip(corners, *_surroundings(points)) for corners in around]
         camera = _Camera.framing(np.concatenate([points, *shown]), radius, size[0] / size[1], view)
         pv = _pyvista()
-        self.tubes = [Tubes.around(part, radius, sides=SIDES, samples=SAMPLES) for part in parts]
+        self.tubes = [Tubes.around(part, sides=SIDES, samples=SAMPLES) for part in parts]
         self.plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
         self._check_size(size)
         # one colour: a gradient is drawn by a shader that leaves what the shading of nooks reads undefined, so that
