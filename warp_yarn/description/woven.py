@@ -28,6 +28,8 @@ OF_CROSSINGS = {
 
 Numbers = float | np.ndarray
 """One number, or one of each."""
+Each = float | Sequence | np.ndarray
+"""As they are given."""
 
 
 class Woven(Fixed):
