@@ -5,9 +5,11 @@ import importlib.metadata
 from types import ModuleType
 
 from . import moved
+from .description import outline
 from .description.cloth import Cloth
 from .description.cloths import Cloths
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
+from .description.pieces import piece
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
@@ -56,7 +58,9 @@ __all__ = [
     "Yarn",
     "__version__",
     "fabrics",
+    "outline",
     "paper",
+    "piece",
     "read_published",
     "register_integrator",
     "register_term",

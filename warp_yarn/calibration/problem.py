@@ -162,8 +162,11 @@ class CalibrationProblem:
         return self.low + y * self.width
 
     def field(self, residuals: np.ndarray) -> np.ndarray:
-        """Shapes residuals as [frames, rows, columns, 3]."""
-        weave = _weave(self.scene.cloth)
+        """Shapes residuals as [frames, rows, columns, 3]; of a cloth that is cut all nodes are one row."""
+        cloth = self.scene.cloth
+        weave = _weave(cloth)
+        if cloth.nodes != weave.rows * weave.columns:
+            return residuals.reshape(-1, 1, cloth.nodes, 3)
         return residuals.reshape(-1, weave.rows, weave.columns, 3)
 
     def scene_with(self, values: np.ndarray) -> Scene:

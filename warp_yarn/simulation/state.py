@@ -18,9 +18,9 @@ from ..description.yarn import SIZES, Yarn
 from ..errors import InputError, choice, finite_array, integer, real
 from ..io.files import atomic_write
 
-FORMAT = 4
+FORMAT = 5
 """Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth; 3 had
-single numbers of cloths, no crimp and no sizes of yarns."""
+single numbers of cloths, no crimp and no sizes of yarns; 4 had no outlines and no seams."""
 
 SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
@@ -216,8 +216,17 @@ def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
         "warp": cloth.warp,
         "weft": cloth.weft,
         "rest": cloth.position,
+        **_packed_outline(cloth),
         **given,
     }
+
+
+def _packed_outline(cloth: Cloth) -> dict[str, Any]:
+    """Packs what a cloth is cut to."""
+    if cloth.outline is None:
+        return {}
+    corners = np.concatenate([np.zeros((0, 2)), *cloth.holes])
+    return {"outline": cloth.outline, "holes": corners, "hole_corners": [len(hole) for hole in cloth.holes]}
 
 
 def _unpacked_cloths(data: Any) -> Cloth | Cloths:
@@ -248,12 +257,15 @@ def _unpacked_cloth(data: Any, of: str) -> Cloth:
             numbers[name] = numbers[name], value(f"{name}_weft")
     if np.isnan(numbers["friction_damping"]).any():
         numbers["friction_damping"] = None
+    ends = np.cumsum(data[f"{of}hole_corners"]) if f"{of}hole_corners" in data else ()
     return Cloth(
         Weave(data[f"{of}draft"], str(data[f"{of}weave"])),
         yarns=yarns,
         warp=data[f"{of}warp"].tolist(),
         weft=data[f"{of}weft"].tolist(),
         pose=data[f"{of}rest"],
+        outline=data[f"{of}outline"] if f"{of}outline" in data else None,
+        holes=np.split(data[f"{of}holes"], ends[:-1]) if len(ends) else (),
         **numbers,
     )
 
