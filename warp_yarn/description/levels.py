@@ -73,7 +73,7 @@ def levels(topology: Topology, stencil: int, free: np.ndarray) -> Levels:
 
     Args:
         topology: its index arrays.
-        stencil: how many upper neighbours of a node the matrix has: 2, 4 or 6.
+        stencil: how many upper neighbours of a node the matrix has: 2, 4, 6 or 8.
         free: [nodes] whether a node moves; what is held takes no part in any level.
     """
     place = topology.place
@@ -208,9 +208,13 @@ def _galerkin(
         for m in range(4):
             row, column = up[a, k], up[b, m]
             some = (row >= 0) & (column >= row)
-            row, column = row[some], column[some]
-            slot = slot_of[tuple((coarse[column] - coarse[row] + 2).T)]
-            found.append((BLOCKS * row + slot, source[some], weight[a[some], k] * weight[b[some], m]))
+            # what is sewn together may be anywhere: that has no part in the levels
+            apart = coarse[column * some] - coarse[row * some] + 2
+            some &= ((apart >= 0) & (apart < len(slot_of))).all(axis=1)
+            row, apart = row[some], apart[some]
+            found.append(
+                (BLOCKS * row + slot_of[tuple(apart.T)], source[some], weight[a[some], k] * weight[b[some], m])
+            )
     return tuple(np.concatenate(values) for values in zip(*found, strict=True))  # type: ignore[return-value]
 
 

@@ -15,6 +15,7 @@ from .cloth import Cloth
 from .cloths import Cloths, as_one
 from .fixed import Fixed
 from .obstacles import Contact, Obstacle
+from .seams import checked_seams
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,9 @@ class Scene(Fixed):
         obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
         self_contact: whether the cloth may touch itself; else it passes through itself.
         contact: the law of contact; None: as ``Contact()``.
+        seams: pairs of nodes that are sewn together [n, 2], of one cloth or of two, at most two of a node. They do not
+            go with self_contact, which would hold them apart.
+        seam_stiffness: k of the spring of each pair [N/m], above 0.
     """
 
     def __init__(
@@ -82,6 +86,8 @@ class Scene(Fixed):
         obstacles: Sequence[Obstacle] = (),
         self_contact: bool = False,
         contact: Contact | None = None,
+        seams: Any = (),
+        seam_stiffness: float = 1e4,
     ):
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
@@ -96,9 +102,13 @@ class Scene(Fixed):
         checked = _checked_forces(forces)
         self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
         self.force_path = _force_path(checked)
+        self.seams = checked_seams(seams, self.cloth.nodes)
+        self.seam_stiffness = real("seam_stiffness", seam_stiffness, above=0.0)
+        if len(self.seams) and self_contact:
+            raise InputError("seams with self_contact=True, must be False: it would hold apart what is sewn together")
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
-        self._parameters = self._checked_parameters(parameters)
+        self._parameters = _checked_parameters(parameters, len(self.cloth.yarns))
         if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
             raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
         self.obstacles = tuple(obstacles)
@@ -123,6 +133,8 @@ class Scene(Fixed):
             obstacles=self.obstacles,
             self_contact=self.self_contact,
             contact=contact,
+            seams=self.seams,
+            seam_stiffness=self.seam_stiffness,
         )
 
     def __repr__(self) -> str:
@@ -169,12 +181,13 @@ class Scene(Fixed):
 
         def values(scene: Scene) -> list[np.ndarray]:
             missing = np.zeros(0)
-            arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
+            arrays = [scene.seams, scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
             return [missing if array is None else array for array in arrays]
 
         names = (
             "wind",
             "pin_stiffness",
+            "seam_stiffness",
             "sliding",
             "terms",
             "published_scaling",
@@ -215,26 +228,6 @@ class Scene(Fixed):
                 return f"parameters has no {parameter.name!r}"
         return term.absent(self) if term.absent is not None else ""
 
-    def _checked_parameters(self, given: Any) -> dict[str, Any]:
-        """Checks {name: value}, each as ``checked_parameter`` leaves it."""
-        if given is None:
-            return {}
-        if not isinstance(given, Mapping):
-            raise InputError(f"parameters = {given!r}, must be a dictionary, {{name: value}}")
-        known = {p.name: p for term in in_order().values() if not own(term) for p in term.parameters}
-        others, result = parameters(), {}
-        for name, value in given.items():
-            if name not in known and name in others:
-                raise InputError(
-                    f"parameters names {name!r}, must be given to Yarn, Cloth, Wind or Scene by its argument"
-                )
-            if name not in known:
-                raise InputError(
-                    f"parameters names {name!r}, must be of a registered term: {', '.join(known) or 'there is none'}"
-                )
-            result[name] = checked_parameter(known[name], value, len(self.cloth.yarns))
-        return result
-
 
 def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> Any:
     """Checks a value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
@@ -244,6 +237,25 @@ def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> A
         values = finite_array(parameter.name, value, (materials,)).tolist()
         return tuple(real(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
     return real(parameter.name, value, **parameter.range)
+
+
+def _checked_parameters(given: Any, materials: int) -> dict[str, Any]:
+    """Checks {name: value}, each as ``checked_parameter`` leaves it."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"parameters = {given!r}, must be a dictionary, {{name: value}}")
+    known = {p.name: p for term in in_order().values() if not own(term) for p in term.parameters}
+    others, result = parameters(), {}
+    for name, value in given.items():
+        if name not in known and name in others:
+            raise InputError(f"parameters names {name!r}, must be given to Yarn, Cloth, Wind or Scene by its argument")
+        if name not in known:
+            raise InputError(
+                f"parameters names {name!r}, must be of a registered term: {', '.join(known) or 'there is none'}"
+            )
+        result[name] = checked_parameter(known[name], value, materials)
+    return result
 
 
 def _checked_forces(forces: Any) -> dict[int, np.ndarray]:

@@ -53,6 +53,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "friction": "friction" in names,
         "shear": "shear" in names or others,
         "wind": "wind" in names or others,
+        "seams": "seams" in names,
         "has gravity": scene.gravity is not None,
         "has wind": scene.wind is not None,
         "has pins": len(scene.pins) > 0,

@@ -264,7 +264,7 @@ def _unpacked_cloth(data: Any, of: str) -> Cloth:
         warp=data[f"{of}warp"].tolist(),
         weft=data[f"{of}weft"].tolist(),
         pose=data[f"{of}rest"],
-        outline=data[f"{of}outline"] if f"{of}outline" in data else None,
+        outline=data.get(f"{of}outline"),
         holes=np.split(data[f"{of}holes"], ends[:-1]) if len(ends) else (),
         **numbers,
     )
@@ -281,6 +281,8 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "pins": scene.pins,
         "pin_stiffness": scene.pin_stiffness,
         "pin_path": scene.pin_path,
+        "seams": scene.seams,
+        "seam_stiffness": scene.seam_stiffness,
         "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
         "force_nodes": scene.force_nodes,
         **{f"force_{node}": force for node, force in scene.forces.items()},
@@ -318,6 +320,9 @@ def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         obstacles=_unpacked_obstacles(data),
         self_contact="scene_self_contact" in data and value("self_contact").item(),
         contact=Contact(**_arguments(data, "contact")),
+        **(
+            {"seams": value("seams"), "seam_stiffness": value("seam_stiffness").item()} if "scene_seams" in data else {}
+        ),
     )
 
 
