@@ -24,6 +24,8 @@ from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, 
 from .terms import (
     applied_force,
     bending,
+    crimp_interchange,
+    crimped_contact,
     crossing_normal,
     friction,
     gravity,
@@ -43,6 +45,7 @@ _OWN = (
     inertia.INERTIA,
     inertia.MASS_RATE,
     stretch.TERM,
+    crimp_interchange.TERM,
     bending.TERM,
     gravity.TERM,
     jamming.TERM,
@@ -122,6 +125,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         "contact_normal": crossing_normal.define_normal(variant),
         "update_anchor": friction.define_anchor(variant),
     }
+    kernels |= vars(crimped_contact.define(variant))
     for term in _OWN:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
@@ -163,5 +167,6 @@ def _build_general(variant: Variant) -> dict[str, wp.Kernel]:
             if term.energy is not None:
                 kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     kernels["update_anchor"] = friction.define_anchor(variant)
+    kernels |= vars(crimped_contact.define(variant))
     kernels |= vars(ros2.define_reversible(variant)) | vars(newton.define_turning(variant.forward))
     return kernels

@@ -24,7 +24,7 @@ import into_box
 import numpy as np
 import torch
 import tqdm
-from common import add_slowdown, command, file_ending, make_folders, write_all
+from common import add_slowdown, add_weave, command, file_ending, make_folders, woven_cloth, write_all
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
@@ -80,7 +80,7 @@ class Throw:
         )
         speed = self.distance / self.duration
         # An impulse of `scale` on each of so many variables moves the centre as one of √count times that on one.
-        self.scale = mass(cloth) * speed / (self.step * np.sqrt(PUSHED * 4)) if forces else speed
+        self.scale = cloth.mass * speed / (self.step * np.sqrt(PUSHED * 4)) if forces else speed
         self.shape = self.rollout.inputs["forces"] if forces else (3,)
 
     def start(self) -> torch.Tensor:
@@ -115,13 +115,6 @@ class Throw:
             velocity = np.broadcast_to(value, (cloth.nodes, 3))
             simulator.state = dataclasses.replace(simulator.state, velocity=velocity)
         return simulator.run(self.steps)
-
-
-def mass(cloth: wy.Cloth) -> float:
-    """Of all yarns [kg]."""
-    rows, columns = cloth.weave.rows, cloth.weave.columns
-    lengths = cloth.spacing * np.array([columns - 1] * rows + [rows - 1] * columns)
-    return float(lengths @ [cloth.yarns[k].density for k in cloth.material])
 
 
 @dataclasses.dataclass
@@ -211,7 +204,7 @@ def parser() -> argparse.ArgumentParser:
     add = result.add_argument
     add("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     add("--size", type=int, default=9, metavar="N", help="rows and columns (%(default)s)")
-    add("--weave", choices=wy.WEAVES, default="plain", help="(%(default)s)")
+    add_weave(result)
     add("--target", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0.3, 0.1, 0.2), help="m (0.3 0.1 0.2)")
     add("--time", type=float, default=0.25, metavar="SECONDS", help="until it shall be there (%(default)s)")
     add("--steps", type=int, default=250, help="time steps in it (%(default)s)")
@@ -247,8 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     real("--rate", options.rate, above=0.0)
     real("--within", options.within, least=0.0)
     make_folders([options.output, options.plot, options.result])
-    make = FABRICS[options.fabric]
-    cloth = make(weave=options.weave, rows=options.size, columns=options.size, pose="flat")
+    cloth = woven_cloth(options.fabric, options, options.size, options.size, pose="flat")
     throw = Throw(
         cloth,
         options.target,

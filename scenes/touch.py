@@ -9,7 +9,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from common import Run, add_slowdown, file_ending, make_folders, read_number, simulate, write_all
+from common import (
+    Run,
+    add_slowdown,
+    add_weave,
+    file_ending,
+    make_folders,
+    read_number,
+    simulate,
+    woven_cloth,
+    write_all,
+)
 
 import warp_yarn as wy
 from warp_yarn.errors import integer
@@ -31,7 +41,7 @@ def parser(text: str | None, name: str, *, rows: int, columns: int, steps: int) 
     add("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     add("--rows", type=int, default=rows, help="number of warp yarns (%(default)s)")
     add("--columns", type=int, default=columns, help="number of weft yarns (%(default)s)")
-    add("--weave", choices=wy.WEAVES, default="plain", help="(%(default)s)")
+    add_weave(result)
     add("--friction", type=float, default=0.3, metavar="MU", help="of all that touches (%(default)s)")
     add("--integrator", choices=INTEGRATORS, default="implicit-euler", help="(%(default)s)")
     add("--steps", type=int, default=steps, help="how many (%(default)s)")
@@ -67,7 +77,7 @@ def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argp
 
 def flat(options: argparse.Namespace) -> wy.Cloth:
     """The cloth of the options, flat, its middle in the origin."""
-    cloth = FABRICS[options.fabric](weave=options.weave, rows=options.rows, columns=options.columns, pose="flat")
+    cloth = woven_cloth(options.fabric, options, options.rows, options.columns, pose="flat")
     return cloth.replace(pose=cloth.position - cloth.position.mean(axis=0))
 
 
@@ -78,7 +88,7 @@ def raised(cloth: wy.Cloth, height: float) -> wy.Cloth:
 
 def rest(cloth: wy.Cloth) -> float:
     """D + d̂ of the default, and a trifle [m]."""
-    return 2.0 * cloth.radius * (1.0 + 1e-6)
+    return 2.0 * cloth.half_thickness * (1.0 + 1e-6)
 
 
 def scene(cloth: wy.Cloth, options: argparse.Namespace, *others: wy.Cloth, **more: object) -> wy.Scene:
@@ -86,7 +96,7 @@ def scene(cloth: wy.Cloth, options: argparse.Namespace, *others: wy.Cloth, **mor
     contact = wy.Contact(friction=options.friction)
     if options.seed is not None:
         aside = np.random.default_rng(options.seed).uniform(-0.01, 0.01, cloth.position.shape)
-        cloth = cloth.replace(pose=cloth.position + cloth.spacing * aside)
+        cloth = cloth.replace(pose=cloth.position + cloth.shortest_spacing * aside)
     return wy.Scene([cloth, *others], sliding=not options.locked, self_contact=True, contact=contact, **more)
 
 
@@ -169,9 +179,9 @@ def clearance(trajectory: wy.Trajectory) -> Clearance:
     """Looks at every frame."""
     cloth, frames = trajectory.cloth, len(trajectory)
     law = wy.Contact() if trajectory.scene is None else trajectory.scene.contact
-    distance = law.distance or cloth.radius
-    self_distance = law.self_distance or max(1.5 * cloth.spacing, 3.0 * cloth.radius)
-    reach = self_distance + (law.self_range or cloth.spacing)
+    distance = law.distance or cloth.half_thickness
+    self_distance = law.self_distance or max(1.5 * cloth.longest_spacing, 3.0 * cloth.half_thickness)
+    reach = self_distance + (law.self_range or cloth.longest_spacing)
     gap, apart = np.full(frames, np.inf), np.full(frames, np.inf)
     for each in placed(trajectory):
         for frame in range(frames):

@@ -33,6 +33,7 @@ def natural(c: wy.Cloth, term: str) -> float:
     density = max(yarn.density for yarn in c.yarns)
     return {
         "stretch": max(yarn.stretch for yarn in c.yarns) * area,
+        "crimp_interchange": max(yarn.stretch for yarn in c.yarns) * area,
         "bending": max(yarn.bend for yarn in c.yarns) * area / length**2,
         "shear": np.max(c.shear) * area,
         "gravity": density * length * 9.8,

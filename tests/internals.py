@@ -18,6 +18,7 @@ from warp_yarn.device.contact import Near
 from warp_yarn.device.impact_zones import Projected
 from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
+from warp_yarn.simulation.linear_system import read_system
 from warp_yarn.view import render
 
 # -- a simulator's arrays ---------------------------------------------------------------------------------------------
@@ -33,6 +34,20 @@ def put(simulator: wy.Simulator, name: str, values: object) -> None:
     """Writes into an array that kernels use; one number goes everywhere."""
     array = simulator.arrays[name]
     array.assign(np.broadcast_to(np.asarray(values), array.numpy().shape))
+
+
+def stiffness_at_evaluation(simulator: wy.Simulator, state: wy.State, evaluations: int) -> np.ndarray:
+    """H of the matrix that Newton's iteration has after so many evaluations in a stage."""
+    simulator.state = state
+    simulator.arrays.put("evaluations", evaluations)
+    simulator.arrays.put("coefficients", 0.0, 0.0, 1.0)
+    simulator.model.assemble()
+    return read_system(simulator.model).dense()
+
+
+def has_any(simulator: wy.Simulator, *names: str) -> bool:
+    """Whether the simulator knows any array of these names at all."""
+    return bool(set(names) & set(simulator.arrays))
 
 
 def add_array(simulator: wy.Simulator, name: str, array: str | None) -> None:

@@ -19,7 +19,8 @@ import warp_yarn as wy
 
 RIGHT = 0.5 * math.pi
 TERMS = (
-    "inertia", "mass_rate", "stretch", "bending", "gravity", "parallel", "shear", "wind", "pins", "applied", "friction",
+    "inertia", "mass_rate", "stretch", "crimp_interchange", "bending", "gravity", "parallel", "shear", "wind", "pins",
+    "applied", "friction",
 )  # fmt: skip
 
 Tensor = torch.Tensor
@@ -116,6 +117,64 @@ def bending(q: Tensor, k: Tensor, l1: Tensor, l2: Tensor) -> Tensor:
     """q = (x_a, x_c, x_b, s_a, s_b); l1 of c to b, l2 of a to c."""
     e1, e2 = q[6:9] - q[3:6], q[0:3] - q[3:6]
     return faded(k * angle_squared(unit(e1), -unit(e2)), k * math.pi**2, e1, e2, l1, l2) / (q[10] - q[9])
+
+
+def crimped_segment(p: Tensor, h: Tensor, rest: Tensor, k: Tensor, b: Tensor, woven: Tensor) -> Tensor:
+    """Energy of a segment that rises by h; woven = (distance, length) as woven."""
+    cosine = woven[0] / woven[1]
+    sine = torch.sqrt(1.0 - cosine**2)
+    strain = torch.sqrt(p**2 + 9.0 / 8.0 * h**2) / rest - 1.0
+    beam = 12.0 * b / woven[1] ** 2
+    limit = 0.25 * beam * cosine**2
+    y = k * torch.clamp(-strain, min=0.0) / limit
+    pull = torch.where(strain > 0.0, 0.5 * k * strain**2, limit**2 / k * (y - torch.log1p(y)))
+    off = math.sqrt(9.0 / 8.0) * h * cosine - p * sine
+    return rest * pull + 0.5 * beam * off**2 / rest
+
+
+def crimped_crossing(q: Tensor, parts: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor) -> Tensor:
+    """q = (x of the crossing and left, right, up, down of it, their u, their v); parts of the four segments that are
+    crimped, and woven of each [4, 2]; k, b [2] of warp and weft."""
+    return crossing_of_lengths(*segments_of(q), parts, k, b, woven, total)
+
+
+def segments_of(q: Tensor) -> tuple[Tensor, Tensor]:
+    """p and Δs of a crossing's four segments."""
+    x, u, v = q[:15].reshape(5, 3), q[15:20], q[20:25]
+    p = torch.linalg.vector_norm(x[1:] - x[0], dim=1)
+    return p, torch.stack([u[0] - u[1], u[2] - u[0], v[0] - v[3], v[4] - v[0]])
+
+
+def crossing_of_lengths(
+    p: Tensor, rest: Tensor, parts: Tensor, k: Tensor, b: Tensor, woven: Tensor, total: Tensor
+) -> Tensor:
+    """The least energy of any h."""
+
+    def energy(h: Tensor, p: Tensor, rest: Tensor) -> Tensor:
+        heights = torch.stack([h, h, total - h, total - h])
+        each = vmap(crimped_segment)(p, heights, rest, k.repeat_interleave(2), b.repeat_interleave(2), woven)
+        return (parts * each).sum()
+
+    slope = grad(energy)
+    low, high = -3.0 * total, 4.0 * total
+    fixed = p.detach(), rest.detach()
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = slope(middle, *fixed) > 0.0
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    h = (0.5 * (low + high)).detach()
+    # every step of Newton's iteration makes another derivative exact
+    for _ in range(2):
+        curvature = grad(slope)(h, p, rest)
+        h = h - torch.where(curvature > 0.0, slope(h, p, rest) / torch.where(curvature > 0.0, curvature, 1.0), 0.0)
+    return energy(h, p, rest)
+
+
+def straight_segment(q: Tensor, k: Tensor, part: Tensor, woven: Tensor) -> Tensor:
+    """As stretch, of a yarn that keeps its crimp."""
+    rest = q[7] - q[6]
+    strain = torch.linalg.vector_norm(q[3:6] - q[0:3]) / rest * woven[1] / woven[0] - 1.0
+    return part * 0.5 * k * rest * strain**2
 
 
 def lock(phi: Tensor, threshold: Tensor | float, ratio: Tensor | float) -> Tensor:
@@ -334,11 +393,46 @@ class Oracle:
             k.append(yarn.bend * self.area(yarn))
         self.bending = Elements(torch.tensor(unknowns), bending, (tensor(k), tensor(l1), tensor(l2)))
 
+        self._build_crimp()
         nodes = [int(node) for node in scene.pins]
         k = tensor([scene.pin_stiffness] * len(nodes))
         self.pins = Elements(
             torch.tensor([self.unknowns(node) for node in nodes]), pin, (k, tensor(cloth.position[nodes]))
         )
+
+    def woven(self, a: tuple[int, int], b: tuple[int, int]) -> list[float]:
+        """Distance of two crossings (j, i), and length of the yarn between them, as woven."""
+        distance = self.distance(a, b)
+        return [distance, distance * self.longer(a, 0 if a[0] == b[0] else 1)]
+
+    def _build_crimp(self) -> None:
+        """Crossings, and segments that are straight: of border yarns, and where a yarn stays on one side."""
+
+        def inside(j: int, i: int) -> bool:
+            return 0 < j < self.rows - 1 and 0 < i < self.columns - 1
+
+        unknowns, parts, k, b, woven, total = [], [], [], [], [], []
+        for j, i in self.crossings():
+            near = [(j, i - 1), (j, i + 1), (j - 1, i), (j + 1, i)]
+            nodes = [self.node(j, i), *(self.node(*at) for at in near)]
+            along = [self.slide(node, direction) for direction in (0, 1) for node in nodes]
+            unknowns.append([*self.unknowns(*nodes), *along])
+            changes = [self.flipped[at[0]][at[1]] != self.flipped[j][i] for at in near]
+            parts.append([0.5 * change if inside(*at) else 1.0 for at, change in zip(near, changes, strict=True)])
+            yarns = (self.warp[j], self.weft[i])
+            k.append([yarn.stretch * self.area(yarn) for yarn in yarns])
+            b.append([yarn.bend * self.area(yarn) for yarn in yarns])
+            woven.append([self.woven((j, i), at) for at in near])
+            total.append(sum(2.0 * self.halves(yarn)[1] for yarn in yarns))
+        parameters = (tensor(parts), tensor(k), tensor(b), tensor(woven), tensor(total))
+        self.interchange = Elements(torch.tensor(unknowns), crimped_crossing, parameters)
+        k, part, woven = [], [], []
+        for (a, c), _direction, yarn in self.chains(2):
+            floats = inside(*a) and inside(*c) and self.flipped[a[0]][a[1]] == self.flipped[c[0]][c[1]]
+            part.append(float(floats or not (inside(*a) or inside(*c))))
+            k.append(yarn.stretch * self.area(yarn))
+            woven.append(self.woven(a, c))
+        self.straight = self._segments(straight_segment, k, part, woven)
 
     def shear(self, contact_force: Tensor) -> Elements:
         """F_n of every node is held."""
@@ -399,19 +493,66 @@ class Oracle:
         normal = torch.zeros_like(x).index_put((torch.tensor(at),), n * sign.detach()[:, None])
 
         load = torch.zeros(self.nodes, dtype=torch.float64)
+        crimped = self.scene.contact_force == "crimped"
         for term, length in (("stretch", 2), ("bending", 3)):
-            if term not in self.scene.terms:
+            if term not in self.scene.terms or self.scene.crimp_interchange:
                 continue
             for direction, sign in ((0, 1.0), (1, -1.0)):
-                yarns = getattr(self, term).of([d == direction for _, d, _ in self.chains(length)])
-                yarn = (self.warp, self.weft)[direction]
-                grid = [(j, i) for j in range(self.rows) for i in range(self.columns)]
-                half = tensor([self.halves(yarn[where[direction]])[1] for where in grid])
-                crimp = -sign * half[:, None] * normal if term == "bending" else torch.zeros_like(x)
+                which = [d == direction for _, d, _ in self.chains(length)]
+                yarns = getattr(self, term).of(which)
+                half = tensor([self.offset(j, i, direction) for j in range(self.rows) for i in range(self.columns)])
+                crimp = -sign * half[:, None] * normal if term == "bending" or crimped else torch.zeros_like(x)
                 moved = torch.cat([(x + crimp).ravel(), q[3 * self.nodes :]])
-                force = yarns.force(moved)[: 3 * self.nodes].reshape(self.nodes, 3)
+                if term == "stretch" and crimped:
+                    force = self.turned(yarns, q, moved)
+                else:
+                    force = yarns.force(moved)[: 3 * self.nodes].reshape(self.nodes, 3)
                 load = load + 0.5 * sign * torch.sum(normal * force, dim=1)
+        if "crimp_interchange" in self.scene.terms:
+            load = load + self.interchange_load(q, normal)
         return normal, torch.relu(load)
+
+    def offset(self, j: int, i: int, direction: int) -> float:
+        """How far from its node a yarn passes at a crossing: its half thickness, or half the height of its crimp."""
+        if self.scene.contact_force == "published":
+            return self.halves((self.warp[j], self.weft[i])[direction])[1]
+        distance = sum(self.along[direction]) / len(self.along[direction])
+        crimp = self.longer((j, i), direction) - 1.0
+        return 2.0 / 3.0 * distance * math.sqrt(crimp + 0.5 * crimp**2)
+
+    def turned(self, yarns: Elements, q: Tensor, moved: Tensor) -> Tensor:
+        """Forces of stretch [nodes, 3], each turned into the direction of its segment between moved positions."""
+        force = torch.zeros(self.nodes, 3, dtype=torch.float64)
+        pull = -vmap(grad(yarns.local))(q[yarns.unknowns], *yarns.parameters)[:, 0:3]
+        d = q[yarns.unknowns][:, 3:6] - q[yarns.unknowns][:, 0:3]
+        along = moved[yarns.unknowns][:, 3:6] - moved[yarns.unknowns][:, 0:3]
+        size = torch.sum(pull * d, dim=1) / torch.linalg.vector_norm(d, dim=1)
+        pull = size[:, None] * along / torch.linalg.vector_norm(along, dim=1)[:, None]
+        a, b = yarns.unknowns[:, 0] // 3, yarns.unknowns[:, 3] // 3
+        return force.index_add(0, a, pull).index_add(0, b, -pull)
+
+    def interchange_load(self, q: Tensor, normal: Tensor) -> Tensor:
+        """What holds h₁ + h₂, 2 ∂W/∂(d₁ + d₂), and half the difference of what warp and weft pull with."""
+        e = self.interchange
+        holds = 2.0 * vmap(grad(e.local, argnums=5))(q[e.unknowns], *e.parameters)
+        load = torch.zeros(self.nodes, dtype=torch.float64).index_add(0, e.unknowns[:, 0] // 3, holds)
+
+        def by_p(q: Tensor, *parameters: Tensor) -> Tensor:
+            p, rest = segments_of(q)
+            return grad(crossing_of_lengths)(p, rest, *parameters)
+
+        # on the crossing and its four neighbours
+        x = q[e.unknowns][:, :15].reshape(-1, 5, 3)
+        d = x[:, 1:] - x[:, :1]
+        pull = vmap(by_p)(q[e.unknowns], *e.parameters)[:, :, None] * d / torch.linalg.vector_norm(d, dim=2)[:, :, None]
+        nodes = e.unknowns[:, :15:3] // 3
+        for direction, half in ((0, 0.5), (1, -0.5)):
+            force = self.straight.of([d == direction for _, d, _ in self.chains(2)]).force(q)
+            force = force[: 3 * self.nodes].reshape(self.nodes, 3)
+            for side in (2 * direction, 2 * direction + 1):
+                force = force.index_add(0, nodes[:, 0], pull[:, side]).index_add(0, nodes[:, side + 1], -pull[:, side])
+            load = load + half * torch.sum(normal * force, dim=1)
+        return load
 
     # -- forces
 
@@ -421,6 +562,9 @@ class Oracle:
         result = force(q, v, anchor) if force else getattr(self, term).force(q)
         x, s = result[: 3 * self.nodes], result[3 * self.nodes :]
         return torch.cat([x, s * self.slides])
+
+    def _crimp_interchange_force(self, q: Tensor, *_: Tensor) -> Tensor:
+        return self.interchange.force(q) + self.straight.force(q)
 
     def _shear_force(self, q: Tensor, *_: Tensor) -> Tensor:
         return self.shear(self.contact(q)[1]).force(q)

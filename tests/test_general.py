@@ -13,9 +13,12 @@ import torch
 import warp_yarn.learn as wl
 from cases import GENERAL, cloth
 from inputs import EXACT, WIND, jittered, scaled
+from internals import numbers
+from reference import Oracle, tensor
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
+from warp_yarn.device import defaults
 
 YARN = wy.Yarn(density=2.0e-3, stretch=5.0e5, bend=1.4e-4)
 PLAIN = wy.Weave.plain(rows=5, columns=6)
@@ -67,7 +70,7 @@ def test_numbers_that_are_all_the_same_are_one(options: dict) -> None:
     """And cost nothing: the kernels are those of a plain cloth."""
     c = wy.Cloth(PLAIN, **{"yarns": [YARN], "radius": 3e-4, **options})
     assert not c.general and c.spacing == 1e-3 and c.radius == 3e-4
-    assert wy.Simulator(wy.Scene(c)).arrays["spacing"].shape == (1,)
+    assert numbers(wy.Simulator(wy.Scene(c)), "spacing").shape == (1,)
     assert c.replace(pose="flat").radius == 3e-4
 
 
@@ -180,6 +183,53 @@ def test_a_cloth_of_two_setts_stretches_by_its_yarns() -> None:
     assert pulled == pytest.approx(5e5 * sections * 1.1 * strain, rel=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_random_numbers(seed: int) -> None:
+    """Forces are the oracle's, whatever the numbers are, and a run ends well or in an error of ours."""
+    random = np.random.default_rng(seed)
+    rows, columns, kinds = (int(n) for n in random.integers((3, 3, 1), (6, 7, 4)))
+    gaps = [10.0 ** random.uniform(-3.5, -2.5, n - 1) for n in (rows, columns)]
+    room = min(gap.min() for gap in gaps)
+    yarns = [
+        wy.Yarn(
+            density=10.0 ** random.uniform(-5, -3),
+            stretch=10.0 ** random.uniform(4, 8),
+            bend=10.0 ** random.uniform(-5, -3),
+            width=room * random.uniform(0.1, 1.0),
+            thickness=room * random.uniform(0.05, 1.0),
+        )
+        for _ in range(kinds)
+    ]
+    c = wy.Cloth(
+        wy.Weave(random.integers(0, 2, (rows, columns))),
+        yarns=yarns,
+        spacing=tuple(gaps),
+        crimp=tuple(random.uniform(0.0, 0.2, n) for n in (rows, columns)),
+        shear=random.uniform(10.0, 1e5, (kinds, kinds)),
+        friction=random.uniform(0.0, 1.0, rows * columns),
+        pose="flat",
+    )
+    scene = hung(c)
+    simulator, oracle = wy.Simulator(scene), Oracle(scene)
+    state = simulator.state
+    state.position += 0.1 * room * random.uniform(-1.0, 1.0, state.position.shape)
+    inside = (c.topology.is_crossing != 0)[:, None]
+    state.euler += 0.1 * room * random.uniform(-1.0, 1.0, state.euler.shape) * inside
+    q = tensor(np.concatenate([state.position.ravel(), state.euler.ravel()]))
+    still = torch.zeros_like(q)
+    for term, (x, s) in simulator.forces(state).items():
+        expected = oracle.force(term, q, still, tensor(state.anchor.ravel())).numpy()
+        found = np.concatenate([x.ravel(), s.ravel()])
+        # of sums of some tens of numbers, and of a normal whose gap is some 1e-2
+        assert np.abs(found - expected).max() <= 1e-11 * max(np.abs(expected).max(), 1e-12), term
+    simulator.state = state
+    try:
+        run = simulator.run(20)
+    except wy.SimulationError as error:
+        run = error.trajectory
+    assert np.isfinite(run.position).all() and np.isfinite(run.euler).all()
+
+
 def test_several_cloths_of_different_numbers_move_as_they_do_alone() -> None:
     one = wy.Cloth(PLAIN, yarns=[YARN], friction_damping=0.1)
     other = dict(GENERAL)
@@ -199,9 +249,19 @@ def test_the_choice_of_a_preconditioner_goes_by_the_stiffest_segment() -> None:
     """k_s h²/(m L): of one short gap among long ones."""
     soft = wy.Cloth(PLAIN, **SMALL, spacing=(1e-2, 1e-2 * np.linspace(1.0, 1.1, 5)), friction_damping=0.0)
     step = 1.7 * 1e-2 / math.sqrt(YARN.stretch * np.pi * 4e-8 / YARN.density)
-    assert wy.Simulator(wy.Scene(soft), step=step).model.preconditioner == "incomplete"
+    assert defaults.preconditioner(wy.Scene(soft), step) == "incomplete"
     short = soft.replace(spacing=(1e-2, [1e-2, 1e-3, 1e-2, 1e-2, 1e-2]))
-    assert wy.Simulator(wy.Scene(short), step=step).model.preconditioner == "multilevel"
+    assert defaults.preconditioner(wy.Scene(short), step) == "multilevel"
+
+
+def test_contact_goes_by_the_thickest_yarn_and_the_longest_gap() -> None:
+    """So that no yarn of another layer finds a hole to pass through."""
+    scene = wy.Scene(cloth("general"), obstacles=[wy.Plane(point=(0, 0, -1), normal=(0, 0, 1))], self_contact=True)
+    arrays = wy.Simulator(scene).arrays
+    of = {name: float(arrays[name].numpy()[0]) for name in arrays if name.endswith(("contact_distance", "range"))}
+    assert of["contact_distance"] == of["contact_range"] == 3.2e-4
+    assert of["self_contact_distance"] == pytest.approx(1.5 * 1.4e-3)
+    assert of["self_contact_range"] == pytest.approx(1.4e-3)
 
 
 # -- gradients and learning ------------------------------------------------------------------------------------------

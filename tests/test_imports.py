@@ -39,7 +39,7 @@ FORBIDDEN = {
     f"{W}.envs": {K, f"{W}.device", f"{W}.integrators", f"{W}.calibration", f"{W}.io", f"{W}.view"},
 }  # fmt: skip
 """What no module of a room imports."""
-TERMS_BY_NAME = {f"{W}.description.scene"}
+TERMS_BY_NAME = {f"{W}.description.scene", f"{W}.description.selection"}
 """A scene looks up which terms there are; no other description knows kernels."""
 
 ONLY = {
@@ -49,6 +49,7 @@ ONLY = {
     "stable_baselines3": set(),
     "pxr": {f"{W}.io.usd"},
     "h5py": {f"{W}.io.published"},
+    "dtx_to_wif": {f"{W}.io.draft"},
     "pyvista": set(),
     "scenes": set(),
     "benchmarks": set(),
@@ -58,7 +59,8 @@ ONLY = {
 """Where a package may be imported at all; render.py asks for PyVista by name."""
 
 BETWEEN_TERMS = {(f"{K}.terms.jamming", f"{K}.terms.stretch")}
-"""The barrier between crossings takes k_s of the yarn from there."""
+BETWEEN_TERMS |= {(f"{K}.terms.crimp_interchange", f"{K}.terms.{name}") for name in ("stretch", "bending")}
+"""The barrier between crossings takes k_s of the yarn from there, and crimp interchange k_b too."""
 
 
 def modules() -> dict[str, Path]:
@@ -154,6 +156,7 @@ def test_importing_the_package_loads_no_extra():
     extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
     extras |= {"gymnasium", "stable_baselines3"}
     assert not loaded & extras
+    assert "dtx_to_wif" not in loaded
 
 
 # -- the tests --------------------------------------------------------------------------------------------------------

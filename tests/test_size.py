@@ -30,12 +30,12 @@ VERBS = set(
         limit linearize list load look lower lump make match measure merge minimize mirror mix move multiply name
         normalize note number open pack parse pass pay perform pick place plot prepare prescribe press print probe
         produce project propagate prove pull push put raise reach read ready rebuild recall receive record recover
-        reduce refine refuse register release remember remove rename reorder replace replay report request reset
+        reduce refine refuse register release remember remove rename reorder repeat replace replay report request reset
         resolve restore restrict retreat return reverse rewrite rise roll rotate round run sample save say scale
         scan scatter search seed select send separate set settle shape shorten show shrink shuffle simulate skip
         slide smooth solve sort split spread square start stop store stretch subtract sum swap sweep switch
         symmetrize take tell test throw tidy total track transform translate transpose trust try turn unpack update
-        use validate view visit wait walk warn weigh write yield zero
+        use validate view visit wait walk warn weave weigh write yield zero
         """,
     )
 )

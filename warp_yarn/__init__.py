@@ -8,6 +8,9 @@ from . import moved
 from .description import outline
 from .description.cloth import Cloth
 from .description.cloths import Cloths
+from .description.crimp import crimp_height
+from .description.draft import Draft
+from .description.fibre import FIBRES, Fibre
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.pieces import piece
 from .description.scene import Scene, Wind
@@ -16,6 +19,7 @@ from .description.yarn import Yarn
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
+from .io.draft import read_draft, write_draft
 from .io.published import Published, read_published
 from .io.usd import write_usd
 from .kernels import Term, TermParameter, Variant
@@ -23,6 +27,7 @@ from .presets import fabrics, paper
 from .registration import register_integrator, register_term, unregister_integrator, unregister_term
 from .simulation.simulator import Simulator
 from .simulation.state import State, Trajectory
+from .view.drawdown import write_drawdown
 from .view.render import write_mp4, write_png
 
 moved.install()
@@ -30,6 +35,7 @@ moved.install()
 __version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
+    "FIBRES",
     "WEAVES",
     "Box",
     "Capsule",
@@ -37,6 +43,8 @@ __all__ = [
     "Cloths",
     "Contact",
     "Cylinder",
+    "Draft",
+    "Fibre",
     "GradientError",
     "InputError",
     "Plane",
@@ -57,16 +65,20 @@ __all__ = [
     "Wind",
     "Yarn",
     "__version__",
+    "crimp_height",
     "fabrics",
     "outline",
     "paper",
     "piece",
+    "read_draft",
     "read_published",
     "register_integrator",
     "register_term",
     "sdirk",
     "unregister_integrator",
     "unregister_term",
+    "write_draft",
+    "write_drawdown",
     "write_mp4",
     "write_png",
     "write_usd",

@@ -1,11 +1,14 @@
 """Numbers of a cloth: single ones of a plain cloth, in a general one those of every segment, yarn, node or corner.
 
-    spacing       [2 nodes]      L from a node to the next one of its warp yarn and of its weft yarn, at rest in space
-    radius        [2 yarns]      half the width and half the thickness of a yarn
+    spacing       [4 nodes]      L from a node to the next one of its warp yarn and of its weft yarn, at rest in space;
+                                 after those of all nodes, half the widths of its two yarns
+    radius        [3 yarns]      half the width and half the thickness of a yarn; after those of all, 1 + crimp
     lock_angle    [4 crossings]  φ_l of a corner
     shear, friction, friction_stiffness, friction_damping  [nodes]
 
-Kernels of a plain cloth read entry 0 of each, at no cost: ``own`` is then 0 at compile time.
+Kernels of a plain cloth read entry 0 of each, at no cost: ``own`` is then 0 at compile time. What of ``node_yarns`` and
+``lengthening`` the kernels of every step need stands in these too: Warp copies the arguments for every thread, so that
+one more array takes a tenth of the time of a kernel over segments, of a plain cloth too.
 """
 
 import functools
@@ -44,11 +47,13 @@ def functions(variant: Variant) -> SimpleNamespace:
             return 0
 
     @wp.func
-    def half_width_across(radius: wp.array(dtype=scalar), node_yarns: wp.array(dtype=int), node: int, direction: int):
-        """Look up half the width of the yarn that crosses one of this direction at a node, 0 where none does."""
-        yarn = node_yarns[2 * node + 1 - direction]
-        if yarn >= 0:
-            return radius[2 * yarn]
-        return scalar(0.0)
+    def half_width(spacing: wp.array(dtype=scalar), node: int, direction: int) -> scalar:
+        """Look up half the width of a node's yarn of this direction, 0 where it has none."""
+        return spacing[spacing.shape[0] / 2 + 2 * node + direction]
 
-    return SimpleNamespace(own=own, half_width_across=half_width_across)
+    @wp.func
+    def longer(radius: wp.array(dtype=scalar), yarn: int) -> scalar:
+        """Look up 1 + crimp of a yarn."""
+        return radius[2 * (radius.shape[0] / 3) + yarn]
+
+    return SimpleNamespace(own=own, half_width=half_width, longer=longer)

@@ -39,6 +39,7 @@ SERIES_BELOW = 1.0e-3
 def functions(variant: Variant) -> SimpleNamespace:
     """Make the Warp functions of one bend, shared with the contact force."""
     scalar, vec3 = variant.scalar, variant.vec3
+    presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
     vec2 = wp.types.vector(2, scalar)
 
     @wp.func
@@ -92,17 +93,6 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Compute k_b = B π R² [N m²]."""
         return modulus * scalar(wp.static(wp.PI)) * half_width * half_thickness
 
-    return SimpleNamespace(angle=bend_angle, force=bend_force, stiffness=bend_stiffness)
-
-
-def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, sliding, of_each = variant.scalar, variant.vec3, variant.sliding, variant.general
-    BlockMatrix = structs(variant).BlockMatrix
-    f = functions(variant)
-    bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
-    presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
-    own = general.functions(variant).own
-
     @wp.func
     def bend_forces(e1: vec3, e2: vec3, k: scalar, unit1: scalar, unit2: scalar):
         """Compute the forces on the ends that e1 and e2 lead to."""
@@ -118,6 +108,17 @@ def define(variant: Variant) -> wp.Kernel:
         f1 = bend_force(t1, t2, by_l1, s1, s2, k, angle[0], angle[1])
         f2 = bend_force(t2, t1, by_l2, s2, s1, k, angle[0], angle[1])
         return f1, f2
+
+    return SimpleNamespace(angle=bend_angle, force=bend_force, forces=bend_forces, stiffness=bend_stiffness)
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3, sliding, of_each = variant.scalar, variant.vec3, variant.sliding, variant.general
+    BlockMatrix = structs(variant).BlockMatrix
+    f = functions(variant)
+    bend_angle, bend_force, bend_forces, bend_stiffness = f.angle, f.force, f.forces, f.stiffness
+    presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
+    own = general.functions(variant).own
 
     @wp.func
     def in_plane_excess(z: scalar, cosine: scalar, square: scalar, kappa: scalar, angle_over_sine: scalar) -> scalar:

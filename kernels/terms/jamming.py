@@ -63,7 +63,8 @@ def define(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
     BlockMatrix = structs(variant).BlockMatrix
     barrier, of_each = functions(variant).barrier, variant.general
-    own, half_width_across = general.functions(variant).own, general.functions(variant).half_width_across
+    f = general.functions(variant)
+    own, longer, half_width_at = f.own, f.longer, f.half_width
     stretch_stiffness = stretching.functions(variant).stiffness
 
     @variant.kernel("terms")
@@ -76,8 +77,6 @@ def define(variant: Variant) -> wp.Kernel:
         stretch: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
-        node_yarns: wp.array(dtype=int),
-        lengthening: wp.array(dtype=scalar),
         # state in
         euler: wp.array(dtype=scalar),
         # forces out
@@ -92,10 +91,9 @@ def define(variant: Variant) -> wp.Kernel:
         # half the mean width of the yarns that cross there
         across = half_width
         if wp.static(of_each):
-            half_thickness = lengthening[yarn] * radius[2 * yarn + 1]
-            across = half_width_across(radius, node_yarns, a, direction)
-            across += half_width_across(radius, node_yarns, b, direction)
-            across *= scalar(0.5) * lengthening[yarn]
+            half_thickness = longer(radius, yarn) * radius[2 * yarn + 1]
+            across = half_width_at(spacing, a, 1 - direction) + half_width_at(spacing, b, 1 - direction)
+            across *= scalar(0.5) * longer(radius, yarn)
         distance = scalar(2.0) * across
         if flipped[a] != flipped[b]:
             distance = scalar(2.0) * (across + half_thickness)
@@ -122,7 +120,16 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
     barrier, of_each = functions(variant).barrier, variant.general
-    own, half_width_across = general.functions(variant).own, general.functions(variant).half_width_across
+    own = general.functions(variant).own
+
+    @wp.func
+    def half_width_across(radius: wp.array(dtype=scalar), node_yarns: wp.array(dtype=int), node: int, direction: int):
+        """Look up half the width of the yarn that crosses one of this direction at a node, 0 where none does."""
+        yarn = node_yarns[2 * node + 1 - direction]
+        if yarn >= 0:
+            return radius[2 * yarn]
+        return scalar(0.0)
+
     stretch_stiffness = stretching.functions(variant).stiffness
 
     @variant.kernel("energy")

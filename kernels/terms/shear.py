@@ -132,7 +132,7 @@ def define(variant: Variant) -> wp.Kernel:
     BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
-    shear_ratio = f.ratio
+    shear_ratio, half_width = f.ratio, general.functions(variant).half_width
     presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
 
     @wp.func
@@ -199,7 +199,6 @@ def define(variant: Variant) -> wp.Kernel:
         radius: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
         lock_angle: wp.array(dtype=scalar),
-        node_yarns: wp.array(dtype=int),
         # state in
         position: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=scalar),
@@ -230,8 +229,8 @@ def define(variant: Variant) -> wp.Kernel:
             ratio_ld = shear_ratio(angle_ld)
             ratio_ru = shear_ratio(angle_ru)
             ratio_rd = shear_ratio(angle_rd)
-            warp_width = radius[2 * node_yarns[2 * c]]
-            weft_width = radius[2 * node_yarns[2 * c + 1]]
+            warp_width = half_width(spacing, c, 0)
+            weft_width = half_width(spacing, c, 1)
             unlocked = shear_unlocked(shear[c], warp_width, weft_width, scalar(0.5), contact_load[c])
             soft_lu = unlocked * (u_l + u_u)
             soft_ld = unlocked * (u_l + u_d)

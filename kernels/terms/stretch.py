@@ -45,7 +45,7 @@ def define(variant: Variant) -> wp.Kernel:
     scalar, vec3, sliding, of_each = variant.scalar, variant.vec3, variant.sliding, variant.general
     BlockMatrix = structs(variant).BlockMatrix
     stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
-    own = general.functions(variant).own
+    own, longer = general.functions(variant).own, general.functions(variant).longer
 
     @variant.kernel("terms")
     def stretch_term(
@@ -54,7 +54,6 @@ def define(variant: Variant) -> wp.Kernel:
         # parameters
         stretch: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
-        lengthening: wp.array(dtype=scalar),
         # state in
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
@@ -75,12 +74,12 @@ def define(variant: Variant) -> wp.Kernel:
         half_thickness = half_width
         if wp.static(of_each):
             half_thickness = radius[2 * yarn + 1]
-            d *= lengthening[yarn]
+            d *= longer(radius, yarn)
         k = stretch_stiffness(stretch[yarn], half_width, half_thickness)
 
         f = stretch_force(d, rest, k)
         if wp.static(of_each):
-            f *= lengthening[yarn]
+            f *= longer(radius, yarn)
         wp.atomic_add(force, a, f)
         wp.atomic_add(force, b, -f)
         if add_contact_load != 0:
@@ -100,14 +99,14 @@ def define(variant: Variant) -> wp.Kernel:
             across = along * wp.max(ratio - scalar(1.0), scalar(0.0)) / wp.max(ratio, scalar(1.0e-12))
             xx = wp.outer(t, t) * (along - across) + wp.identity(n=3, dtype=scalar) * across
             if wp.static(of_each):
-                xx *= lengthening[yarn] * lengthening[yarn]
+                xx *= longer(radius, yarn) * longer(radius, yarn)
             wp.atomic_add(blocks.diagonal_xx, a, xx)
             wp.atomic_add(blocks.diagonal_xx, b, xx)
             wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + direction), -xx)
             if wp.static(sliding):
                 xs = t * (along * ratio)
                 if wp.static(of_each):
-                    xs *= lengthening[yarn]
+                    xs *= longer(radius, yarn)
                 ss = along * ratio * ratio
                 wp.atomic_add(blocks.diagonal_xs, sa, -xs)
                 wp.atomic_add(blocks.diagonal_xs, sb, -xs)
@@ -123,14 +122,13 @@ def define(variant: Variant) -> wp.Kernel:
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar, vec3, of_each = variant.scalar, variant.vec3, variant.general
     stretch_stiffness = functions(variant).stiffness
-    own = general.functions(variant).own
+    own, longer = general.functions(variant).own, general.functions(variant).longer
 
     @variant.kernel("energy")
     def stretch_energy(
         segments: wp.array(dtype=wp.vec4i),
         stretch: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
-        lengthening: wp.array(dtype=scalar),
         position: wp.array(dtype=vec3),
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
@@ -142,7 +140,7 @@ def define_energy(variant: Variant) -> wp.Kernel:
         half_thickness = half_width
         if wp.static(of_each):
             half_thickness = radius[2 * yarn + 1]
-            length *= lengthening[yarn]
+            length *= longer(radius, yarn)
         strain = length / rest - scalar(1.0)
         k = stretch_stiffness(stretch[yarn], half_width, half_thickness)
         wp.atomic_add(energy, 0, scalar(0.5) * k * rest * strain * strain)
@@ -156,6 +154,7 @@ TERM = Term(
     define=define,
     energy=define_energy,
     parameters=(TermParameter("stretch", "Pa", least=0.0, of="yarn"),),
+    absent=lambda scene: "crimp_interchange takes its place" if scene.crimp_interchange else "",
     stencil=2,
     presses=True,
     energy_watched_as="elastic_energy",

@@ -17,7 +17,7 @@ from warp_yarn.device.fields import Field
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
 VARIANTS += [dataclasses.replace(variant, general=True) for variant in VARIANTS[:4]]
 STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAdjoint", "Levels"}
-STRUCTS |= {"Pairs", "Obstacles", "Faces"}
+STRUCTS |= {"Pairs", "Obstacles", "Faces", "Crimp"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
 """Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""
@@ -87,7 +87,7 @@ def test_arrays_are_as_declared(name, options, sliding):
     segments = rows * (columns - 1) + columns * (rows - 1)
     sizes = {"world": 1, "node": nodes, "segment": segments, "yarn": rows + columns, "crossing": crossings}
     sizes["frame node"] = 4 * nodes
-    numbers = {"gap": 2 * nodes, "half": 2 * (rows + columns), "corner": 4 * crossings, "cloth crossing": nodes}
+    numbers = {"gap": 4 * nodes, "half": 3 * (rows + columns), "corner": 4 * crossings, "cloth crossing": nodes}
     sizes |= numbers if name == "general" else dict.fromkeys(numbers, 1)
     for name, array in arrays.items():
         if name == "levels":

@@ -163,11 +163,9 @@ class CalibrationProblem:
 
     def field(self, residuals: np.ndarray) -> np.ndarray:
         """Shapes residuals as [frames, rows, columns, 3]; of a cloth that is cut all nodes are one row."""
-        cloth = self.scene.cloth
-        weave = _weave(cloth)
-        if cloth.nodes != weave.rows * weave.columns:
-            return residuals.reshape(-1, 1, cloth.nodes, 3)
-        return residuals.reshape(-1, weave.rows, weave.columns, 3)
+        weave, nodes = _weave(self.scene.cloth), self.scene.cloth.nodes
+        rows = weave.rows if nodes == weave.rows * weave.columns else 1
+        return residuals.reshape(-1, rows, nodes // rows, 3)
 
     def scene_with(self, values: np.ndarray) -> Scene:
         """Copies the scene with these values."""

@@ -186,7 +186,9 @@ class Cloth(Places):
         lines = self._lines()
         self.size = float(lines[0][-1]), float(lines[1][-1])
         self._cut: Cut | None = None
-        self.outline, self.holes, yarn_line = None, (), np.arange(rows + self.weave.columns)
+        self.outline: np.ndarray | None = None
+        self.holes: tuple[np.ndarray, ...] = ()
+        yarn_line = np.arange(rows + self.weave.columns)
         if outline is None:
             if len(holes):
                 raise InputError("holes without an outline, must have one: [[0, 0], [u, 0], [u, v], [0, v]] of all")

@@ -256,5 +256,5 @@ def _triangles(index: np.ndarray, neighbour: np.ndarray) -> np.ndarray:
 
 
 def _beside(neighbour: np.ndarray, slot: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Tells of pairs of nodes whether the second one is the first one's next on its yarn."""
+    """Tells whether the second node of each pair is the first one's next on its yarn."""
     return ((low >= 0) & (high >= 0) & (neighbour[low, slot] == high)).ravel()

@@ -252,10 +252,12 @@ class Contact(Fixed):
     Args:
         method: "barrier" or "impact-zones".
         stiffness: κ of a contact [N/m], above 0; None: m (3 m/s / range)², m the mean mass of a node.
-        distance: D, how near nodes may come to obstacles [m], above 0; None: the yarns' radius.
-        range: d̂, beyond D, over which obstacles push [m], above 0; None: the yarns' radius.
-        self_distance: D of cloth on cloth, between nodes [m], above 0; None: 1.5 spacings, or 3 radii if that is more.
-        self_range: d̂ of cloth on cloth [m], above 0; None: the spacing.
+        distance: D, how near nodes may come to obstacles [m], above 0; None: the yarns' radius, half
+            the thickness of the thickest.
+        range: d̂, beyond D, over which obstacles push [m], above 0; None: the same.
+        self_distance: D of cloth on cloth, between nodes [m], above 0; None: 1.5 spacings, of the
+            longest, or 3 of those radii if that is more.
+        self_range: d̂ of cloth on cloth [m], above 0; None: that spacing.
         friction: μ of cloth on cloth, at least 0; None: 0.3 of a barrier. (Each obstacle has its own.)
         slip_speed: ε, at which friction reaches μ f_n [m/s], above 0: what sticks creeps, at ε (1 − √(1 − r)) under a
             share r of that.

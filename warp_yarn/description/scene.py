@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, indices, real
-from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
+from ..errors import InputError, finite_array, indices, real
+from ..kernels import TERMS, TermParameter, own
 from .cloth import Cloth
 from .cloths import Cloths, as_one
+from .crimp import check_crimp
 from .fixed import Fixed
 from .obstacles import Contact, Obstacle
 from .seams import checked_seams
+from .selection import checked_parameters, selected_terms
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,11 @@ class Scene(Fixed):
         seams: pairs of nodes that are sewn together [n, 2], of one cloth or of two, at most two of a node. They do not
             go with self_contact, which would hold them apart.
         seam_stiffness: k of the spring of each pair [N/m], above 0.
+        contact_force: what presses warp and weft together at a crossing: "published", eq. 3, whose stretch forces are
+            those of the straight segments; "crimped", of segments that rise by the crimp of the yarns, so that a flat
+            cloth's feels their tension.
+        crimp_interchange: whether yarns that are crimped straighten at each other's expense before they stretch: the
+            term of that name, in place of stretch, with a contact force of its own. Yarns must be crimped as woven.
     """
 
     def __init__(
@@ -88,6 +95,8 @@ class Scene(Fixed):
         contact: Contact | None = None,
         seams: Any = (),
         seam_stiffness: float = 1e4,
+        contact_force: str = "published",
+        crimp_interchange: bool = False,
     ):
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
@@ -108,7 +117,7 @@ class Scene(Fixed):
             raise InputError("seams with self_contact=True, must be False: it would hold apart what is sewn together")
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
-        self._parameters = _checked_parameters(parameters, len(self.cloth.yarns))
+        self._parameters = checked_parameters(parameters, len(self.cloth.yarns))
         if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
             raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
         self.obstacles = tuple(obstacles)
@@ -117,7 +126,10 @@ class Scene(Fixed):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
         self.contact.check_obstacles(self.obstacles)
-        self.terms = self._terms(terms)
+        self.contact_force = contact_force
+        self.crimp_interchange = bool(crimp_interchange)
+        check_crimp(self.cloth, contact_force, self.crimp_interchange)
+        self.terms = selected_terms(self, terms)
         self._fix(
             cloth=self.cloth,
             gravity=self.gravity,
@@ -135,6 +147,8 @@ class Scene(Fixed):
             contact=contact,
             seams=self.seams,
             seam_stiffness=self.seam_stiffness,
+            contact_force=self.contact_force,
+            crimp_interchange=self.crimp_interchange,
         )
 
     def __repr__(self) -> str:
@@ -194,6 +208,8 @@ class Scene(Fixed):
             "parameters",
             "self_contact",
             "contact",
+            "contact_force",
+            "crimp_interchange",
         )
         return (
             self.cloth.same_as(other.cloth)
@@ -203,59 +219,6 @@ class Scene(Fixed):
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
-
-    def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
-        if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
-            raise InputError(f"terms = {names!r}, must be a list of names")
-        names = None if names is None else tuple(names)
-        known = in_order()
-        missing = {name: reason for name, term in known.items() if (reason := self._lacks(term))}
-        if names is None:
-            given = {name for name, term in known.items() if any(p.name in self._parameters for p in term.parameters)}
-            return tuple(name for name, term in known.items() if name not in missing and (own(term) or name in given))
-        for name in names:
-            choice("terms", name, known)
-            if name in missing:
-                raise InputError(f"terms names {name!r}, but {missing[name]}")
-        return tuple(name for name in known if name in names or name == "mass")
-
-    def _lacks(self, term: Term) -> str:
-        """Says why the scene has no use for a term, or ""."""
-        if term.sliding_only and not self.sliding:
-            return "yarns do not slide (sliding=False)"
-        for parameter in () if own(term) else term.parameters:
-            if parameter.default is None and parameter.name not in self._parameters:
-                return f"parameters has no {parameter.name!r}"
-        return term.absent(self) if term.absent is not None else ""
-
-
-def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> Any:
-    """Checks a value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
-    if parameter.size == 3:
-        return tuple(finite_array(parameter.name, value, (3,)).tolist())
-    if parameter.of == "yarn" and not np.isscalar(value):
-        values = finite_array(parameter.name, value, (materials,)).tolist()
-        return tuple(real(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
-    return real(parameter.name, value, **parameter.range)
-
-
-def _checked_parameters(given: Any, materials: int) -> dict[str, Any]:
-    """Checks {name: value}, each as ``checked_parameter`` leaves it."""
-    if given is None:
-        return {}
-    if not isinstance(given, Mapping):
-        raise InputError(f"parameters = {given!r}, must be a dictionary, {{name: value}}")
-    known = {p.name: p for term in in_order().values() if not own(term) for p in term.parameters}
-    others, result = parameters(), {}
-    for name, value in given.items():
-        if name not in known and name in others:
-            raise InputError(f"parameters names {name!r}, must be given to Yarn, Cloth, Wind or Scene by its argument")
-        if name not in known:
-            raise InputError(
-                f"parameters names {name!r}, must be of a registered term: {', '.join(known) or 'there is none'}"
-            )
-        result[name] = checked_parameter(known[name], value, materials)
-    return result
 
 
 def _checked_forces(forces: Any) -> dict[int, np.ndarray]:

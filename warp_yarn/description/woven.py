@@ -89,6 +89,11 @@ class Woven(Fixed):
         return result
 
     @functools.cached_property
+    def node_widths(self) -> np.ndarray:
+        """Half the widths of the warp yarn and the weft yarn of every node, 0 where there is none [nodes, 2] (m)."""
+        return np.where(self.node_yarns >= 0, self.halves[self.node_yarns, 0], 0.0)
+
+    @functools.cached_property
     def corner_lock(self) -> np.ndarray:
         """φ_l of every corner [crossings, 4] (rad): left up, left down, right up, right down.
 
@@ -96,14 +101,11 @@ class Woven(Fixed):
         to it and b half the mean width of the two yarns that cross there and at the crossing: 2 arcsin(R/L) where all
         are the same.
         """
-        topology, yarns = self.topology, self.node_yarns
-        crossing, width = topology.crossing_node, self.halves[:, 0]
+        topology, crossing = self.topology, self.topology.crossing_node
         angles = []
         for k, neighbour in enumerate(topology.crossing_neighbours.T):
             along = k // 2  # left and right along the warp yarn
-            across = yarns[crossing, 1 - along], yarns[neighbour, 1 - along]
-            # what ends there has no yarn across
-            b = 0.5 * sum(np.where(yarn >= 0, width[yarn], 0.0) for yarn in across)
+            b = 0.5 * (self.node_widths[crossing, 1 - along] + self.node_widths[neighbour, 1 - along])
             distance = np.abs(self.rest_grid[neighbour, along] - self.rest_grid[crossing, along])
             angles.append(np.arcsin(np.minimum(b / distance, 1.0)))
         return np.stack([angles[p] + angles[r] for p in (0, 1) for r in (2, 3)], axis=1)

@@ -19,7 +19,7 @@ from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
-from . import contact, declarations
+from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
 
@@ -77,6 +77,7 @@ class Arrays(DeclaredArrays):
         for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
             self.make(group)
         contact.set_arrays(self)
+        crimp.set_arrays(self)
 
     def node_mass(self) -> float:
         """Compute the mean mass of a node [kg]."""
@@ -103,8 +104,8 @@ class Arrays(DeclaredArrays):
             "segments": np.column_stack([topology.segment_nodes, yarn, topology.yarn_direction[yarn]]),
             "neighbour": topology.neighbour[:, : self.stencil].ravel(),
             "is_free": free,
-            "corner_blocks": self._blocks(topology.corner_blocks),
-            "triangle_blocks": self._blocks(topology.triangle_blocks),
+            "corner_blocks": self.blocks(topology.corner_blocks),
+            "triangle_blocks": self.blocks(topology.triangle_blocks),
             "seam_nodes": self.scene.seams.ravel(),
             "seam_block": self.seam_block,
             "node_yarns": cloth.node_yarns.ravel() if "general" in self.conditions else None,
@@ -116,7 +117,7 @@ class Arrays(DeclaredArrays):
             else:
                 self._indices(name, made[name] if name in made else getattr(topology, name))
 
-    def _blocks(self, blocks: np.ndarray) -> np.ndarray:
+    def blocks(self, blocks: np.ndarray) -> np.ndarray:
         """Find matrix blocks of a stencil six wide in the scene's own."""
         return blocks if self.stencil <= 6 else self.stencil * (blocks // 6) + blocks % 6
 
@@ -165,8 +166,8 @@ class Arrays(DeclaredArrays):
             elif not general or name not in ("spacing", "radius"):
                 self[name] = self.numbers(getattr(cloth, name))
         if general:
-            self["spacing"] = self.numbers(cloth.node_spacing.ravel())
-            self["radius"] = self.numbers(cloth.halves.ravel())
+            self["spacing"] = self.numbers(np.concatenate([cloth.node_spacing, cloth.node_widths]).ravel())
+            self["radius"] = self.numbers(np.append(cloth.halves, 1.0 + cloth.yarn_crimp))
             self["lock_angle"] = self.numbers(cloth.corner_lock.ravel())
         else:
             self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
@@ -223,8 +224,8 @@ def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:
     """Count what the numbers of a cloth are of: one of each in a plain cloth."""
     topology = cloth.topology
     counts = {
-        "gap": 2 * topology.nodes,
-        "half": 2 * len(topology.yarn_direction),
+        "gap": 4 * topology.nodes,
+        "half": 3 * len(topology.yarn_direction),
         "corner": 4 * len(topology.crossing_node),
         "cloth crossing": topology.nodes,
     }

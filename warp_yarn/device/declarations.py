@@ -2,10 +2,8 @@
 
 Arrays are made from these declarations (``arrays.py``), and no other name can be set or launched with. A test holds
 every argument of every kernel to them (``tests/kernels/test_declarations.py``). A group is what is made together.
-
 One **world** is one independent simulation of a batch. Today there is one; what steers it (status, step length,
 tolerances, counters) is an array over worlds all the same.
-
 The field ``when`` names a condition of the scene (``fields.conditions``). Where it does not hold the name is None.
 """
 
@@ -28,21 +26,20 @@ TOPOLOGY: Group = {
     "triangle_nodes": Field("triangle", 1, "vec3i", "", "wind", "its nodes"),
     "triangle_blocks": Field("triangle", 1, "vec3i", "", "wind", "matrix blocks of its edges"),
     "seam_nodes": Field("seam", 2, "int", "", "seams", "its two nodes"),
-    "seam_block": Field("seam", 1, "int", "", "seams", "the matrix block between them"),
+    "seam_block": Field("seam", 1, "int", "", "seams", "their matrix block"),
     "is_crossing": Field("node", 1, "int", "", "always", "1 at a crossing, 0 on the border"),
     "is_free": Field("node", 1, "int", "", "always", "0 where a hard pin holds a node, else 1"),
     "flipped": Field("node", 1, "int", "", "always", "the draft: which yarn is on top"),
     "node_yarns": Field("node", 2, "int", "", "general", "its warp yarn and its weft yarn, or -1"),
     "neighbour": Field("block", 1, "int", "", "always", "upper neighbours of a node in the matrix, or -1"),
-}
-"""Index arrays (``description/topology.py``, ``description/seams.py``)."""
+}  # of description/topology.py and seams.py
 
 PARAMETERS: Group = {
     "density": Field("yarn", 1, "scalar", "kg/m", "always", "ρ"),
     "stretch": Field("yarn", 1, "scalar", "Pa", "always", "stretch modulus Y"),
     "bend": Field("yarn", 1, "scalar", "Pa m²", "always", "bending modulus B"),
-    "spacing": Field("gap", 1, "scalar", "m", "always", "L"),
-    "radius": Field("half", 1, "scalar", "m", "always", "R; of each yarn half the width and half the thickness"),
+    "spacing": Field("gap", 1, "scalar", "m", "always", "L; and half the widths of a node's yarns"),
+    "radius": Field("half", 1, "scalar", "m", "always", "R, half the width and half the thickness; and 1 + crimp"),
     "lengthening": Field("yarn", 1, "scalar", "", "general", "1 + crimp: length over the distance that it covers"),
     "shear": Field("cloth crossing", 1, "scalar", "Pa", "always", "shear modulus S"),
     "friction": Field("cloth crossing", 1, "scalar", "", "always", "μ"),
@@ -54,8 +51,8 @@ PARAMETERS: Group = {
     "published_scaling": Field("count", 1, "int", "", "always", "1: friction with arguments in SI units, as published"),
 }
 """What a scene says of its yarns and its cloth. A plain cloth has one gap, half, corner and cloth crossing; a general
-one (``kernels/core/general.py``) two gaps of each node, two halves of each yarn, four corners of each crossing, and as
-many cloth crossings as nodes."""
+one (``kernels/core/general.py``) four gaps of each node, three halves of each yarn, four corners of each crossing, and
+as many cloth crossings as nodes."""
 
 INPUTS: Group = {
     "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g"),
@@ -228,6 +225,13 @@ CONTACT_INPUTS: Group = {
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
 
+CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
+    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
+    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
+    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
+    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
+}
+
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
     "increment": Field("node", 1, "vec3", "m/s", "always", "velocities whose momentum the right-hand side has"),
@@ -378,6 +382,7 @@ GROUPS: dict[str, Group] = {
     "Levels": LEVELS,
     "Contact": CONTACT,
     "ContactInputs": CONTACT_INPUTS,
+    "Crimp": CRIMP,
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,

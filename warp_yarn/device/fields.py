@@ -65,5 +65,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "obstacles": len(scene.obstacles) > 0 and scene.has_barrier,
         "obstacles move": scene.has_barrier and any(obstacle.path is not None for obstacle in scene.obstacles),
         "self-contact": scene.self_contact and scene.has_barrier,
+        "crimp interchange": "crimp_interchange" in names,
+        "crimped contact": scene.contact_force == "crimped",
     }
     return {name for name, value in holds.items() if value}

@@ -161,14 +161,13 @@ class Model:
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
-            self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
+            self.launch_term(term, matrix=filled, add_contact_load=_presses(self, term), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def _find_normals(self) -> None:
         """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
         if self.arrays.contact:
-            self.arrays.zero("contact_load")
-            self.launch("contact_normal", "crossings")
+            _find_crossings(self)
         self.contact.find()
 
     def add_contact_load(self) -> None:
@@ -176,7 +175,7 @@ class Model:
         a = self.arrays
         self._find_normals()
         for term in a.terms:
-            if a.contact and term.presses:
+            if term.presses and _presses(self, term):
                 # the forces go where the solver works
                 unused = {"force": a["q_x"], "euler_force": a["q_s"]}
                 self.launch_term(term, matrix=0, add_contact_load=1, **unused)
@@ -233,6 +232,24 @@ class Model:
         self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
         self.launch("record", "nodes")
+
+
+def _find_crossings(model: Model) -> None:
+    """Fills the normals of crossings, and sets their loads to 0, or to those at crimped positions."""
+    model.arrays.zero("contact_load")
+    model.launch("contact_normal", "crossings")
+    if model.scene.contact_force == "crimped":
+        for name in ("stretch", "bending"):
+            if name in model.scene.terms:
+                model.launch(f"crimped_{name}_load", "bends")
+
+
+def _presses(model: Model, term: Term) -> int:
+    """Tells whether a term is to add to the contact loads: stretch and bending are not where these are taken at crimped
+    positions, nor is bending beside crimp interchange, which has what bends the yarns there."""
+    crimped = model.scene.contact_force == "crimped" and term.name in ("stretch", "bending")
+    interchanged = model.scene.crimp_interchange and term.name == "bending"
+    return int(model.arrays.contact and not crimped and not interchanged)
 
 
 def _checked_device(device: Any) -> Any:

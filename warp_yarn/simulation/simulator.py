@@ -75,8 +75,8 @@ class Simulator(Placing):
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
             are free: a RuntimeWarning says where there are not so many. They pay on large cloths
             (``benchmarks/bandwidth.py``).
-        step_error: how far any node may be put wrong in a part of a step, in spacings of the yarns; each step is then
-            made in as many parts as that takes, and ``step`` is the time from frame to frame. For "sdirk2", whose
+        step_error: how far any node may be put wrong in a part of a step, in the least spacing of yarns; each step is
+            then made in as many parts as that takes, and ``step`` is the time from frame to frame. For "sdirk2", whose
             stages tell its error. None: steps are made at once.
         energy_watch: whether a step that gains energy from nowhere is made again, and ends the run where that does not
             help (``docs/solver.md``). False is for who wants a method as it is, such as the paper's eq. 2.

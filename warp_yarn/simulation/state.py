@@ -289,6 +289,9 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "parameters": list(scene.parameters) or None,
         **{f"parameter_{name}": values for name, values in scene.parameters.items()},
         "self_contact": scene.self_contact,
+        # left out where they are what recordings of before have
+        "pressing": None if scene.contact_force == "published" else scene.contact_force,
+        "crimp_interchange": scene.crimp_interchange or None,
         # None is a value of its own there, not always the default
         **{f"contact_{name}": np.nan if value is None else value for name, value in scene.contact._arguments.items()},
         "obstacles": np.array([obstacle.shape for obstacle in scene.obstacles], dtype=str),
@@ -323,6 +326,8 @@ def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         **(
             {"seams": value("seams"), "seam_stiffness": value("seam_stiffness").item()} if "scene_seams" in data else {}
         ),
+        contact_force=value("pressing").item() if "scene_pressing" in data else "published",
+        crimp_interchange="scene_crimp_interchange" in data,
     )
 
 
