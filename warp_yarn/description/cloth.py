@@ -183,7 +183,7 @@ class Cloth(Places):
         gaps = (self.spacing, self.spacing) if isinstance(self.spacing, float) else self.spacing
         check_room(gaps[0], of_lines[:rows, 0], "warp")
         check_room(gaps[1], of_lines[rows:, 0], "weft")
-        lines = self._lines()
+        lines = self.lines
         self.size = float(lines[0][-1]), float(lines[1][-1])
         self._cut: Cut | None = None
         self.outline: np.ndarray | None = None

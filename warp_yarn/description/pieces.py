@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, integer
 from .cloth import Cloth
 from .outline import checked_polygon
 
 
-def piece(fabric: Callable[..., Cloth], outline: Any, holes: Sequence[Any] = (), **options: Any) -> Cloth:
+def piece(
+    fabric: Callable[..., Cloth], outline: Any, holes: Sequence[Any] = (), *, coarsened: int = 1, **options: Any
+) -> Cloth:
     """Weaves as much of a fabric as an outline needs, and cuts it.
 
     Args:
@@ -20,6 +22,7 @@ def piece(fabric: Callable[..., Cloth], outline: Any, holes: Sequence[Any] = (),
             weft yarns, such as ``wy.fabrics.cotton``.
         outline: the corners of a polygon (u, v) [n, 2] (m), anywhere in the plane, such as ``wy.outline.disc(0.1)``.
         holes: polygons in it.
+        coarsened: n, yarns to one: ``Cloth.coarsened``.
         options: of the fabric.
 
     Returns:
@@ -36,10 +39,11 @@ def piece(fabric: Callable[..., Cloth], outline: Any, holes: Sequence[Any] = (),
     warp, weft = sample.spacing if isinstance(sample.spacing, tuple) else (sample.spacing, sample.spacing)
     if np.ndim(warp) or np.ndim(weft):
         raise InputError("fabric has yarns at several distances, must have one: cut a cloth of it by Cloth.cut")
+    n = integer("coarsened", coarsened, least=1)
     # what is a hair too far apart for rounding alone is no yarn more
-    needed = np.ceil((high - low) / np.array([weft, warp]) * (1.0 - 1e-12)).astype(int) + 1
-    columns, rows = np.maximum(needed, 3).tolist()
-    cloth = fabric(rows=rows, columns=columns, **options)
+    needed = np.ceil((high - low) / np.array([n * weft, n * warp]) * (1.0 - 1e-12)).astype(int)
+    columns, rows = (n * np.maximum(needed, 2) + 1).tolist()
+    cloth = fabric(rows=rows, columns=columns, **options).coarsened(n)
     # in the middle of what is woven, that both sides of a symmetric piece are alike
     shift = cloth.middle - 0.5 * (low + high)
     moved = [checked_polygon(f"holes[{k}]", hole) + shift for k, hole in enumerate(holes)]

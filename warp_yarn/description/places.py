@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from ..errors import InputError, choice, finite_array
+from .coarse import coarsened
 from .cutting import Cut, between, cut
 from .outline import checked_outline, checked_polygon, inside, tolerance
 from .topology import Topology
@@ -103,7 +104,7 @@ class Places(Woven):
         """
         if self._cut is not None:
             raise InputError("cut: the cloth is cut already, must be cut once: holes are an argument")
-        found = cut(self.weave, self._lines(), checked_outline(outline, holes, self.size))
+        found = cut(self.weave, self.lines, checked_outline(outline, holes, self.size))
         place = found.topology.place
         root = place[:, 1] + place[:, 0] * self.weave.columns
         changes: dict[str, Any] = {name: getattr(self, name) for name in OF_CROSSINGS}
@@ -112,8 +113,29 @@ class Places(Woven):
             changes["pose"] = between(self.position, self.rest_grid, root, found.at, self.weave.columns)
         return self.replace(outline=outline, holes=holes, **changes)
 
-    def _lines(self) -> tuple[np.ndarray, np.ndarray]:
-        """Finds where weft yarns are along u [columns], and warp yarns along v [rows] (m)."""
+    def coarsened(self, n: int) -> Self:
+        """Makes a cloth of one yarn for n of this one, for fewer nodes and longer steps.
+
+        Kept: mass and stiffness along warp and weft of the whole cloth; bending, and shear (while it lies flat), per
+        area; the angle at which it locks; its thickness; the springs and dampers of friction, and friction while the
+        cloth lies flat. Yarns at the edges stand for (n + 1)/2. Crimp goes into mass and stiffness: what feels it
+        (``crimp_interchange``, ``contact_force="crimped"``) refuses a coarse cloth.
+
+        Not kept: folds and buckles of a few coarse distances; floats, which are n times as long; what a load on a
+        crossing does to shear, through 1 + F_n; friction where yarns press by their tension over a curve, up to n⁴
+        times too much, so that they stick there.
+
+        Args:
+            n: yarns to one, at least 1, a divisor of rows − 1 and of columns − 1.
+
+        Raises:
+            InputError: another n; a cloth that is cut.
+        """
+        return coarsened(self, n)  # type: ignore[arg-type,return-value]
+
+    @property
+    def lines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where weft yarns are along u [columns], and warp yarns along v [rows] (m)."""
         rows, columns = self.weave.rows, self.weave.columns
         if isinstance(self.spacing, float):
             return np.arange(columns) * self.spacing, np.arange(rows) * self.spacing
