@@ -182,7 +182,7 @@ def test_what_feels_crimp_refuses_it() -> None:
 def test_what_is_cut_refuses() -> None:
     c = made("handkerchief", 1)
     with pytest.raises(wy.InputError, match="coarsen it first"):
-        c.cut(wy.outline.disc(7e-3, centre=c.middle)).coarsened(2)
+        c.cut(wy.outline.disc(7e-3, center=c.middle)).coarsened(2)
 
 
 def test_pieces() -> None:

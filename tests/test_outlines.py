@@ -40,10 +40,10 @@ ELL = np.array([[0.3, 0.4], [13.6, 0.4], [13.6, 4.45], [6.55, 4.45], [6.55, 11.7
 CUTS = {
     "all": (box(0, 0, 14, 12), []),
     "off the yarns": (box(0.4, 0.6, 13.3, 11.2), []),
-    "disc": (wy.outline.disc(5.7 * L, centre=(7.1 * L, 6.05 * L), sides=48), []),
-    "bias": (wy.outline.rectangle(11 * L, 5 * L, angle=45.0, centre=(7.2 * L, 6.1 * L)), []),
+    "disc": (wy.outline.disc(5.7 * L, center=(7.1 * L, 6.05 * L), sides=48), []),
+    "bias": (wy.outline.rectangle(11 * L, 5 * L, angle=45.0, center=(7.2 * L, 6.1 * L)), []),
     "ell": (ELL, []),
-    "hole": (box(0, 0, 14, 12), [wy.outline.disc(2.3 * L, centre=(7.1 * L, 6.05 * L), sides=24)]),
+    "hole": (box(0, 0, 14, 12), [wy.outline.disc(2.3 * L, center=(7.1 * L, 6.05 * L), sides=24)]),
     "two holes": (box(0, 0, 14, 12), [box(2.5, 2.5, 4.5, 4.5), box(8.4, 6.4, 11.7, 9.6)]),
 }
 each = pytest.mark.parametrize("name", CUTS)
@@ -277,7 +277,7 @@ def test_places() -> None:
         c.node(6, 7)
     free = int(np.flatnonzero(c.topology.is_end)[0])
     assert c.place(free).startswith("the free end at row")
-    around = c.within(wy.outline.disc(3.5 * L, centre=(7.1 * L, 6.05 * L)))
+    around = c.within(wy.outline.disc(3.5 * L, center=(7.1 * L, 6.05 * L)))
     distance = np.linalg.norm(c.rest_grid - np.array([7.1, 6.05]) * L, axis=1)
     assert set(around) == set(np.flatnonzero(distance <= 3.5 * L).tolist())
     with pytest.raises(wy.InputError, match="no corners"):
@@ -339,7 +339,7 @@ def test_saved_runs(name: str, tmp_path: object) -> None:
 
 RUNS = {
     "disc": lambda: wy.Scene(
-        cut("disc"), wind=WIND, pins=cut("disc").within(wy.outline.disc(1.5 * L, centre=(7 * L, 6 * L)))
+        cut("disc"), wind=WIND, pins=cut("disc").within(wy.outline.disc(1.5 * L, center=(7 * L, 6 * L)))
     ),
     "bias": lambda: wy.Scene(cut("bias"), wind=WIND, pins=[0, 1]),
     "hole": lambda: wy.Scene(cut("hole"), wind=WIND, pins=[0, 14]),
@@ -451,3 +451,88 @@ def test_bad_seams(seams: object, message: str) -> None:
 def test_seams_do_not_go_with_self_contact() -> None:
     with pytest.raises(wy.InputError, match="self_contact"):
         wy.Scene(square(5, 5), seams=[[0, 9]], self_contact=True)
+
+
+# -- with crimp, and with contact -------------------------------------------------------------------------------------
+
+
+def crimped(name: str) -> wy.Cloth:
+    crimp = (0.05, 0.08)
+    radius = 0.25 * sum(wy.crimp_height(L, L * (1.0 + c)) for c in crimp)
+    return cut(name, crimp=crimp, radius=radius)
+
+
+@pytest.mark.parametrize("name", ["disc", "bias", "hole"])
+@pytest.mark.parametrize("options", [{"crimp_interchange": True}, {"contact_force": "crimped"}], ids=str)
+def test_seams_leave_every_other_block_where_it_is(name: str, options: dict) -> None:
+    """The matrix with seams less theirs is that without, whose stencil is narrower; so are the forces."""
+    c = crimped(name)
+    state = state_of(c)
+    plain = wy.Scene(c, wind=WIND, **options)
+    seams = {"seams": [[0, c.nodes - 1], [5, 9]], "seam_stiffness": 40.0}
+    matrices = [
+        wy.Simulator(scene, integrator="linear").system(state, weights=(0.0, 0.0, 1.0)).dense()
+        for scene in (plain, plain.replace(**seams), wy.Scene(c, terms=["seams"], **seams))
+    ]
+    size = np.abs(matrices[0]).max()
+    assert np.abs(matrices[2]).max() > 0.0
+    assert np.abs(matrices[1] - matrices[2] - matrices[0]).max() < 1e-13 * size
+    forces = [wy.Simulator(scene, integrator="linear").forces(state) for scene in (plain, plain.replace(**seams))]
+    for term, (x, s) in forces[0].items():
+        assert np.array_equal(forces[1][term][0], x) and np.array_equal(forces[1][term][1], s)
+
+
+@pytest.mark.parametrize("name", ["disc", "bias", "hole"])
+def test_crimp_interchange_is_conservative(name: str) -> None:
+    """Also where yarns end: forces are those of the energy, by central differences of fourth order, h = 1e-7 m."""
+    c = crimped(name)
+    state, rng = state_of(c), np.random.default_rng(2)
+    simulator = wy.Simulator(wy.Scene(c, terms=["crimp_interchange"], crimp_interchange=True), integrator="linear")
+    force, along = simulator.forces(state)["crimp_interchange"]
+    inside = (c.topology.is_crossing != 0)[:, None]
+    for _ in range(3):
+        dx, ds = rng.standard_normal((c.nodes, 3)), rng.standard_normal((c.nodes, 2)) * inside
+
+        def energy(h: float, dx: np.ndarray = dx, ds: np.ndarray = ds) -> float:
+            moved = dataclasses.replace(state, position=state.position + h * dx, euler=state.euler + h * ds)
+            return simulator.energy(moved)["crimp_interchange"]
+
+        h = 1e-7
+        slope = (8.0 * (energy(h) - energy(-h)) - (energy(2.0 * h) - energy(-2.0 * h))) / (12.0 * h)
+        expected = -(force * dx).sum() - (along * ds).sum()
+        assert slope == pytest.approx(expected, abs=1e-7 * (np.abs(force * dx).sum() + np.abs(along * ds).sum()))
+
+
+@pytest.mark.parametrize("name", ["disc", "hole"])
+def test_a_cut_cloth_lies_on_a_sphere(name: str) -> None:
+    """No node of it, free ends too, is nearer than half its thickness."""
+    c = cut(name)
+    middle = np.array([7.1, 6.05, 0.0]) * L
+    ball = wy.Sphere(radius=3.5 * L, center=middle - [0.0, 0.0, 4.2 * L])
+    simulator = wy.Simulator(wy.Scene(c, obstacles=[ball]), step=1e-3)
+    trajectory = simulator.run(40)
+    away = np.linalg.norm(trajectory.position - (middle - [0.0, 0.0, 4.2 * L]), axis=2) - 3.5 * L
+    assert away.min() > 0.0
+    assert trajectory.position[-1, :, 2].min() < -1.0 * L
+
+
+@pytest.mark.parametrize("name", ["disc", "bias", "hole", "ell"])
+@pytest.mark.parametrize("shape", ["curves", "mesh"])
+def test_usd(name: str, shape: str, tmp_path: object) -> None:
+    """A curve a yarn, from its first node to its last; finite."""
+    usd = pytest.importorskip("pxr.UsdGeom")
+    stages = pytest.importorskip("pxr.Usd")
+    c = cut(name)
+    trajectory = wy.Simulator(wy.Scene(c), integrator="linear").run(2)
+    path = tmp_path / "cut.usda"
+    wy.write_usd(path, trajectory, tubes=shape == "mesh")
+    stage = stages.Stage.Open(str(path))
+    kind = usd.BasisCurves if shape == "curves" else usd.Mesh
+    found = [kind(prim) for prim in stage.Traverse() if prim.IsA(kind)]
+    assert found
+    points = np.concatenate([np.array(each.GetPointsAttr().Get(1)) for each in found])
+    assert np.isfinite(points).all()
+    if shape == "curves":
+        counts = np.concatenate([np.array(each.GetCurveVertexCountsAttr().Get()) for each in found])
+        # both ends of a curve are there twice
+        assert sorted(counts.tolist()) == sorted(len(yarn) + 2 for yarn in yarns_of(name))

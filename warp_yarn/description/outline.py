@@ -12,12 +12,12 @@ from ..errors import InputError, finite_array, integer, real
 __all__ = ["disc", "rectangle"]
 
 
-def disc(radius: float, *, centre: Sequence[float] = (0.0, 0.0), sides: int = 128) -> np.ndarray:
+def disc(radius: float, *, center: Sequence[float] = (0.0, 0.0), sides: int = 128) -> np.ndarray:
     """Makes the outline of a disc.
 
     Args:
         radius: of its corners [m], above 0.
-        centre: (u, v) [m].
+        center: (u, v) [m].
         sides: of the polygon, at least 3.
 
     Returns:
@@ -25,16 +25,16 @@ def disc(radius: float, *, centre: Sequence[float] = (0.0, 0.0), sides: int = 12
     """
     size = real("radius", radius, above=0.0)
     angle = 2.0 * np.pi * np.arange(integer("sides", sides, least=3)) / sides
-    return finite_array("centre", centre, (2,)) + size * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return finite_array("center", center, (2,)) + size * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def rectangle(length: float, width: float, *, angle: float = 0.0, centre: Sequence[float] = (0.0, 0.0)) -> np.ndarray:
+def rectangle(length: float, width: float, *, angle: float = 0.0, center: Sequence[float] = (0.0, 0.0)) -> np.ndarray:
     """Makes the outline of a rectangle, or of a strip on the bias.
 
     Args:
         length, width: its sides [m], above 0.
         angle: from the warp yarns, which run along u, to its length [degrees]; 45 of a strip on the bias.
-        centre: (u, v) [m].
+        center: (u, v) [m].
 
     Returns:
         Its corners [4, 2] (m), the first two at one end of its length, the others at the other end.
@@ -44,7 +44,7 @@ def rectangle(length: float, width: float, *, angle: float = 0.0, centre: Sequen
     along = np.array([np.cos(turned), np.sin(turned)])
     across = np.array([-along[1], along[0]])
     signs = np.array([[-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]]) * half
-    return finite_array("centre", centre, (2,)) + signs @ np.stack([along, across])
+    return finite_array("center", center, (2,)) + signs @ np.stack([along, across])
 
 
 def checked_polygon(name: str, value: Any) -> np.ndarray:

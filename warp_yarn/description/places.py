@@ -95,7 +95,7 @@ class Places(Woven):
 
         Args:
             outline: the corners of a polygon (u, v) [n, 2] (m) in the plane of the cloth at rest, such as
-                ``wy.outline.disc(radius, centre=cloth.middle)``.
+                ``wy.outline.disc(radius, center=cloth.middle)``.
             holes: polygons in it.
 
         Raises:
