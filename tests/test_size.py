@@ -35,7 +35,7 @@ VERBS = set(
         scan scatter search seed select send separate set settle shape shorten show shrink shuffle simulate skip
         slide smooth solve sort split spread square start stop store stretch subtract sum swap sweep switch
         symmetrize take tell test throw tidy total track transform translate transpose trust try turn unpack update
-        use validate view visit wait walk warn weigh write yield zero
+        use validate view visit wait walk warn weave weigh write yield zero
         """,
     )
 )

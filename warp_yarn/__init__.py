@@ -5,12 +5,14 @@ import importlib.metadata
 from types import ModuleType
 
 from . import moved
+from .description import outline
 from .description.cloth import Cloth
 from .description.cloths import Cloths
 from .description.crimp import crimp_height
 from .description.draft import Draft
 from .description.fibre import FIBRES, Fibre
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
+from .description.pieces import piece
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
@@ -66,7 +68,9 @@ __all__ = [
     "__version__",
     "crimp_height",
     "fabrics",
+    "outline",
     "paper",
+    "piece",
     "read_draft",
     "read_published",
     "register_integrator",

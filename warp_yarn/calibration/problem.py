@@ -162,9 +162,10 @@ class CalibrationProblem:
         return self.low + y * self.width
 
     def field(self, residuals: np.ndarray) -> np.ndarray:
-        """Shapes residuals as [frames, rows, columns, 3]."""
-        weave = _weave(self.scene.cloth)
-        return residuals.reshape(-1, weave.rows, weave.columns, 3)
+        """Shapes residuals as [frames, rows, columns, 3]; of a cloth that is cut all nodes are one row."""
+        weave, nodes = _weave(self.scene.cloth), self.scene.cloth.nodes
+        rows = weave.rows if nodes == weave.rows * weave.columns else 1
+        return residuals.reshape(-1, rows, nodes // rows, 3)
 
     def scene_with(self, values: np.ndarray) -> Scene:
         """Copies the scene with these values."""

@@ -29,8 +29,7 @@ SPEED = 350.0
 
 def warn_of_units(cloth: Cloth) -> None:
     """Warns where a cloth has distances, sizes, crimps or a mass that no fabric has."""
-    columns = cloth.weave.columns
-    gaps = np.diff(cloth.rest_grid[::columns, 1]), np.diff(cloth.rest_grid[:columns, 0])
+    gaps = np.diff(cloth.lines[1]), np.diff(cloth.lines[0])
     every = np.concatenate(gaps)
     _check("spacing", every, DISTANCE, "m", "in metres: 1e-3 for a millimetre")
     for name, values, usual in _sizes(cloth):
@@ -38,9 +37,9 @@ def warn_of_units(cloth: Cloth) -> None:
     _check("crimp", cloth.yarn_crimp, (0.0, CRIMP), "", "a part of the distance: 0.05 for 5 %")
     density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
     long = density * (1.0 + cloth.yarn_crimp)
-    rows = len(cloth.warp)
+    is_weft = cloth.topology.yarn_direction == 1
     # yarns of both directions over an area; of distances that are wrong themselves enough has been said
-    mass = float(long[:rows].mean() / gaps[0].mean() + long[rows:].mean() / gaps[1].mean())
+    mass = float(long[~is_weft].mean() / gaps[0].mean() + long[is_weft].mean() / gaps[1].mean())
     least, most = AREA_DENSITY
     if DISTANCE[0] <= every.min() and every.max() <= DISTANCE[1] and not least <= mass <= most:
         apart = " and ".join(dict.fromkeys(f"{gap.mean():g}" for gap in gaps))

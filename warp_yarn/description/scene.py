@@ -17,6 +17,7 @@ from .crimp import check_crimp
 from .fixed import Fixed, Replaceable, says_why
 from .obstacles import Contact, Obstacle
 from .sanity import warn_of_acceleration, warn_of_speed
+from .seams import checked_seams
 from .selection import checked_parameters, selected_terms
 from .varying import checked_vectors, of_time
 
@@ -76,6 +77,9 @@ class Scene(Fixed):
         obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
         self_contact: whether the cloth may touch itself; else it passes through itself.
         contact: the law of contact; None: as ``Contact()``.
+        seams: pairs of nodes that are sewn together [n, 2], of one cloth or of two, at most two of a node. They do not
+            go with self_contact, which would hold them apart.
+        seam_stiffness: k of the spring of each pair [N/m], above 0.
         contact_force: what presses warp and weft together at a crossing: "published", eq. 3, whose stretch forces are
             those of the straight segments; "crimped", of segments that rise by the crimp of the yarns, so that a flat
             cloth's feels their tension.
@@ -100,6 +104,8 @@ class Scene(Fixed):
         obstacles: Sequence[Obstacle] = (),
         self_contact: bool = False,
         contact: Contact | None = None,
+        seams: Any = (),
+        seam_stiffness: float = 1e4,
         contact_force: str = "published",
         crimp_interchange: bool = False,
     ):
@@ -117,6 +123,10 @@ class Scene(Fixed):
         self.functions = _functions(self.gravity, wind, checked)
         self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
         self.force_path = _force_path(checked)
+        self.seams = checked_seams(seams, self.cloth.nodes)
+        self.seam_stiffness = real("seam_stiffness", seam_stiffness, above=0.0)
+        if len(self.seams) and self_contact:
+            raise InputError("seams with self_contact=True, must be False: it would hold apart what is sewn together")
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
         self._parameters = checked_parameters(parameters, len(self.cloth.yarns))
@@ -148,6 +158,8 @@ class Scene(Fixed):
             obstacles=self.obstacles,
             self_contact=self.self_contact,
             contact=contact,
+            seams=self.seams,
+            seam_stiffness=self.seam_stiffness,
             contact_force=self.contact_force,
             crimp_interchange=self.crimp_interchange,
         )
@@ -196,12 +208,13 @@ class Scene(Fixed):
 
         def values(scene: Scene) -> list[np.ndarray]:
             missing = np.zeros(0)
-            arrays = [scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
+            arrays = [scene.seams, scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
             return [missing if array is None or callable(array) else array for array in arrays]
 
         names = (
             "wind",
             "pin_stiffness",
+            "seam_stiffness",
             "sliding",
             "terms",
             "published_scaling",

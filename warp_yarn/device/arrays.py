@@ -14,6 +14,7 @@ from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
+from ..description.seams import sewn
 from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
@@ -49,7 +50,9 @@ class Arrays(DeclaredArrays):
         # differentiated by positions stays where it is.
         near = variant.scalar is wp.float32 and not variant.reverse
         self.origin = scene.cloth.position.mean(axis=0) if near else np.zeros(3)
-        topology = scene.cloth.topology
+        seams = scene.seams if "seams" in scene.terms else scene.seams[:0]
+        topology, self.seam_block = sewn(scene.cloth.topology, seams)
+        self.topology = topology
         sizes = {
             "world": 1,
             "cloth": 1,
@@ -61,6 +64,7 @@ class Arrays(DeclaredArrays):
             "bend": len(topology.bend_nodes),
             "crossing": len(topology.crossing_node),
             "triangle": len(topology.triangle_nodes),
+            "seam": len(self.seam_block),
             "pin": len(scene.pins),
             "gravity step": _rows(scene.gravity),
             "wind step": 1 if scene.wind is None else _rows(scene.wind.velocity),
@@ -69,9 +73,8 @@ class Arrays(DeclaredArrays):
             "applied step": scene.force_path[..., 0].size,
             **contact.sizes(scene),
         }
-        dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "pin")}
-        dims |= {"applied": sizes["applied"], "obstacles": sizes["obstacle"], "samples": sizes["sample"]}
-        dims["sample_obstacles"] = sizes["sample"] * sizes["obstacle"]
+        dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "seam", "pin")}
+        dims |= contact.dims(sizes) | {"applied": sizes["applied"]}
         super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)
@@ -97,7 +100,7 @@ class Arrays(DeclaredArrays):
         self[name] = wp.array(np.ascontiguousarray(values), **shared) if there else None
 
     def _topology(self, cloth: Cloth | Cloths) -> None:
-        topology, yarn = cloth.topology, cloth.topology.segment_yarn
+        topology, yarn = self.topology, self.topology.segment_yarn
         free = np.ones(topology.nodes, dtype=np.int32)
         if "hard pins" in self.conditions:
             free[self.scene.pins] = 0
@@ -105,6 +108,10 @@ class Arrays(DeclaredArrays):
             "segments": np.column_stack([topology.segment_nodes, yarn, topology.yarn_direction[yarn]]),
             "neighbour": topology.neighbour[:, : self.stencil].ravel(),
             "is_free": free,
+            "corner_blocks": self.blocks(topology.corner_blocks),
+            "triangle_blocks": self.blocks(topology.triangle_blocks),
+            "seam_nodes": self.scene.seams.ravel(),
+            "seam_block": self.seam_block,
             "node_yarns": cloth.node_yarns.ravel() if "general" in self.conditions else None,
         }
         counts = {"nodes": topology.nodes, "columns": cloth.columns, "stencil": self.stencil}
@@ -113,6 +120,10 @@ class Arrays(DeclaredArrays):
                 self[name] = counts[name]
             else:
                 self._indices(name, made[name] if name in made else getattr(topology, name))
+
+    def blocks(self, blocks: np.ndarray) -> np.ndarray:
+        """Find matrix blocks of a stencil six wide in the scene's own."""
+        return blocks if self.stencil <= 6 else self.stencil * (blocks // 6) + blocks % 6
 
     def _parameters(self, scene: Scene) -> None:
         cloth = scene.cloth
@@ -125,6 +136,8 @@ class Arrays(DeclaredArrays):
             self._vectors("wind_velocity", scene.wind.velocity)
             self["wind_density"] = self.numbers(scene.wind.density)
             self["wind_drag"] = self.numbers(scene.wind.drag)
+        if "seams" in self.conditions:
+            self["seam_stiffness"] = self.numbers(scene.seam_stiffness)
         if len(scene.pins):
             wanted = cloth.position[scene.pins] if scene.pin_path is None else scene.pin_path[0]
             self["pin_node"] = wp.array(scene.pins, dtype=wp.int32, device=self.device)
@@ -179,7 +192,7 @@ class Arrays(DeclaredArrays):
     def add_levels(self) -> None:
         """Make room for the multilevel preconditioner: its index arrays, and what it factorizes."""
         free = self["is_free"].numpy() != 0
-        found = levels(self.scene.cloth.topology, self.stencil, free)
+        found = levels(self.topology, self.stencil, free)
         coarse, sizes = found.coarse_nodes, np.diff(found.level_start)
         exact = int(sizes[-1]) if coarse else 0
         self.sizes |= {

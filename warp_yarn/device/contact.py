@@ -62,6 +62,12 @@ def sizes(scene: Scene) -> dict[str, int]:
     }
 
 
+def dims(sizes: dict[str, int]) -> dict[str, int]:
+    """Count what kernels of contact run over, by ``sizes``."""
+    samples, obstacles = sizes["sample"], sizes["obstacle"]
+    return {"obstacles": obstacles, "samples": samples, "sample_obstacles": samples * obstacles}
+
+
 def _steps(scene: Scene) -> int:
     """Count the steps in which an obstacle moves."""
     return max((len(obstacle.path) for obstacle in scene.obstacles if obstacle.path is not None), default=0)

@@ -14,7 +14,7 @@ from .fields import Field, Group
 TOPOLOGY: Group = {
     "nodes": Field("count", 1, "int", "", "always", "nodes of the cloth"),
     "columns": Field("count", 1, "int", "", "always", "nodes of a warp yarn, which threads divide among them"),
-    "stencil": Field("count", 1, "int", "", "always", "upper neighbours of a node in the matrix: 2, 4 or 6"),
+    "stencil": Field("count", 1, "int", "", "always", "upper neighbours of a node in the matrix: 2, 4, 6 or 8"),
     "segments": Field("segment", 1, "vec4i", "", "always", "nodes a < b, yarn, direction (0 warp, 1 weft)"),
     "yarn_direction": Field("yarn", 1, "int", "", "always", "0 of a warp yarn, 1 of a weft yarn"),
     "bend_nodes": Field("bend", 1, "vec3i", "", "always", "consecutive nodes a < c < b of a yarn"),
@@ -25,13 +25,14 @@ TOPOLOGY: Group = {
     "corner_blocks": Field("crossing", 1, "vec4i", "", "shear", "matrix blocks of the same corners"),
     "triangle_nodes": Field("triangle", 1, "vec3i", "", "wind", "its nodes"),
     "triangle_blocks": Field("triangle", 1, "vec3i", "", "wind", "matrix blocks of its edges"),
+    "seam_nodes": Field("seam", 2, "int", "", "seams", "its two nodes"),
+    "seam_block": Field("seam", 1, "int", "", "seams", "their matrix block"),
     "is_crossing": Field("node", 1, "int", "", "always", "1 at a crossing, 0 on the border"),
     "is_free": Field("node", 1, "int", "", "always", "0 where a hard pin holds a node, else 1"),
     "flipped": Field("node", 1, "int", "", "always", "the draft: which yarn is on top"),
     "node_yarns": Field("node", 2, "int", "", "general", "its warp yarn and its weft yarn, or -1"),
     "neighbour": Field("block", 1, "int", "", "always", "upper neighbours of a node in the matrix, or -1"),
-}
-"""Index arrays (``description/topology.py``)."""
+}  # of description/topology.py and seams.py
 
 PARAMETERS: Group = {
     "density": Field("yarn", 1, "scalar", "kg/m", "always", "ρ"),
@@ -60,6 +61,7 @@ INPUTS: Group = {
     "wind_velocity_path": Field("wind step", 1, "vec3", "m/s", "wind changes", "in every step"),
     "wind_density": Field("world", 1, "scalar", "kg/m³", "has wind", "ρ_w"),
     "wind_drag": Field("world", 1, "scalar", "kg/(m² s)", "has wind", "c_d"),
+    "seam_stiffness": Field("world", 1, "scalar", "N/m", "seams", "k of every pair of nodes that is sewn together"),
     "pin_node": Field("pin", 1, "int", "", "has pins", "its node"),
     "pin_target": Field("pin", 1, "vec3", "m", "has pins", "where a pin is at the time of a stage"),
     "pin_target_path": Field("pin step", 1, "vec3", "m", "pins move", "where it is to be after every step"),

@@ -55,6 +55,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "friction": "friction" in names,
         "shear": "shear" in names or others,
         "wind": "wind" in names or others,
+        "seams": "seams" in names,
         "has gravity": scene.gravity is not None,
         "has wind": scene.wind is not None,
         "gravity changes": isinstance(scene.gravity, np.ndarray) and scene.gravity.ndim == 2,

@@ -21,7 +21,8 @@ from ..io.files import atomic_write
 
 FORMAT = 5
 """Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth; 3 had
-single numbers of cloths, no crimp and no sizes of yarns; 4 had no wind that changes from step to step."""
+single numbers of cloths, no crimp and no sizes of yarns; 4 had no wind that changes from step to step, no outlines, no
+seams."""
 
 SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
@@ -223,8 +224,17 @@ def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
         "warp": cloth.warp,
         "weft": cloth.weft,
         "rest": cloth.position,
+        **_packed_outline(cloth),
         **given,
     }
+
+
+def _packed_outline(cloth: Cloth) -> dict[str, Any]:
+    """Packs what a cloth is cut to."""
+    if cloth.outline is None:
+        return {}
+    corners = np.concatenate([np.zeros((0, 2)), *cloth.holes])
+    return {"outline": cloth.outline, "holes": corners, "hole_corners": [len(hole) for hole in cloth.holes]}
 
 
 def _unpacked_cloths(data: Any) -> Cloth | Cloths:
@@ -255,12 +265,15 @@ def _unpacked_cloth(data: Any, of: str) -> Cloth:
             numbers[name] = numbers[name], value(f"{name}_weft")
     if np.isnan(numbers["friction_damping"]).any():
         numbers["friction_damping"] = None
+    ends = np.cumsum(data[f"{of}hole_corners"]) if f"{of}hole_corners" in data else ()
     return Cloth(
         Weave(data[f"{of}draft"], str(data[f"{of}weave"])),
         yarns=yarns,
         warp=data[f"{of}warp"].tolist(),
         weft=data[f"{of}weft"].tolist(),
         pose=data[f"{of}rest"],
+        outline=data.get(f"{of}outline"),
+        holes=np.split(data[f"{of}holes"], ends[:-1]) if len(ends) else (),
         **numbers,
     )
 
@@ -276,6 +289,8 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "pins": scene.pins,
         "pin_stiffness": scene.pin_stiffness,
         "pin_path": scene.pin_path,
+        "seams": scene.seams,
+        "seam_stiffness": scene.seam_stiffness,
         "wind": None if wind is None else [*np.reshape(wind.velocity, (-1, 3))[0], wind.density, wind.drag],
         "wind_path": None if wind is None or np.ndim(wind.velocity) == 1 else wind.velocity,
         "force_nodes": scene.force_nodes,
@@ -318,6 +333,9 @@ def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         obstacles=_unpacked_obstacles(data),
         self_contact="scene_self_contact" in data and value("self_contact").item(),
         contact=Contact(**_arguments(data, "contact")),
+        **(
+            {"seams": value("seams"), "seam_stiffness": value("seam_stiffness").item()} if "scene_seams" in data else {}
+        ),
         contact_force=value("pressing").item() if "scene_pressing" in data else "published",
         crimp_interchange="scene_crimp_interchange" in data,
     )
