@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import warp_yarn.learn as wl
@@ -39,7 +40,7 @@ def sections(text: str, level: str) -> dict[str, str]:
 
 
 def width_and_height(picture: Path) -> tuple[int, int]:
-    return matplotlib.image.imread(picture).shape[1::-1]
+    return plt.imread(picture).shape[1::-1]
 
 
 # What is on it
@@ -108,6 +109,7 @@ def commands() -> list[tuple[str, str]]:
     result = []
     for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
         text = page.read_text()
+        text = text.replace("\\\n", " ")
         found = re.findall(r"^(?:\$ )?python (scenes/\w+\.py[^\n#]*)", text, flags=re.M)
         found += re.findall(r"`python (scenes/\w+\.py[^`]*)`", text)
         result += [(page.name, " ".join(command.split())) for command in found]
@@ -135,7 +137,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    matplotlib.pyplot.close("all")
+    plt.close("all")
 
 
 def run(blocks: list[str], *, names: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -151,7 +153,7 @@ def made(folder: Path, step: str, name: str) -> dict[str, Any]:
     (section,) = (text for heading, text in sections(TUTORIAL, "##").items() if heading.startswith(step))
     names = run(code(section))
     assert f"(tutorial_{name}.png)" in section
-    shown = matplotlib.image.imread(folder / f"{name}.png")[..., :3]
+    shown = plt.imread(folder / f"{name}.png")[..., :3]
     assert np.ptp(shown.reshape(-1, 3), axis=0).max() > 0.5
     assert width_and_height(DOCS / f"tutorial_{name}.png") == width_and_height(folder / f"{name}.png")
     return names
