@@ -1,6 +1,7 @@
 """The documentation site: that nothing is missing on it, that its commands are understood, and that its code runs."""
 
 import importlib
+import linecache
 import re
 import shlex
 from pathlib import Path
@@ -140,11 +141,14 @@ def folder(tmp_path, monkeypatch):
     plt.close("all")
 
 
-def run(blocks: list[str], *, names: dict[str, Any] | None = None) -> dict[str, Any]:
+def run(blocks: list[str]) -> dict[str, Any]:
     """Runs code block after block, and returns the names that it leaves."""
-    names = {} if names is None else names
-    for block in blocks:
-        exec(block, names)
+    names: dict[str, Any] = {}
+    for k, block in enumerate(blocks):
+        # a kernel, or a wp.func, needs a file of its source
+        source = f"block {k}"
+        linecache.cache[source] = (len(block), None, block.splitlines(keepends=True), source)
+        exec(compile(block, source, "exec"), names)
     return names
 
 
