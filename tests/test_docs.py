@@ -16,7 +16,7 @@ import warp_yarn as wy
 from warp_yarn.description.topology import Topology
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def anchors(text: str) -> set[str]:
