@@ -16,6 +16,10 @@ class Weave:
         draft: 0/1 array, rows × columns, at least 3 × 3. 1 where the crossing is flipped: the weft passes on the other
             side of the warp than at a 0. Border nodes are yarn ends, where nothing crosses: their entries count as 0.
         name: what to call it in messages and files.
+
+    Attributes:
+        flipped: the draft, with 0 on the border [rows, columns].
+        draft: the draft as given, whose border pictures show [rows, columns].
     """
 
     def __init__(self, draft: Any, name: str = "draft"):
@@ -31,6 +35,8 @@ class Weave:
             raise InputError(
                 f"a weave of {flipped.shape[0]} × {flipped.shape[1]} has no crossing inside, must be at least 3 × 3"
             )
+        self.draft = flipped.copy()
+        self.draft.setflags(write=False)
         self.flipped = np.zeros_like(flipped)
         self.flipped[1:-1, 1:-1] = flipped[1:-1, 1:-1]
         self.flipped.setflags(write=False)

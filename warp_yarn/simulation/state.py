@@ -201,7 +201,7 @@ def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
     if cloth._arguments["friction_damping"] is None:
         given["friction_damping"] = np.nan  # of its own mass, also where others are beside it
     return {
-        "draft": cloth.weave.flipped,
+        "draft": cloth.weave.draft,
         "weave": cloth.weave.name,
         "yarns": np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns]),
         "colors": np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns]),
