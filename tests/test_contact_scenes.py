@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from internals import pyvista
 from pxr import Usd, UsdGeom
 from scripts import exit_code, load
 
@@ -348,10 +347,6 @@ def test_an_obstacle_moves_and_turns_steadily_between_frames():
 @pytest.mark.slow
 def test_obstacles_are_in_pictures_where_they_are(tmp_path):
     """A sphere seen from the side beneath a cloth, and then above it: grey on background, a yarn where it was."""
-    try:
-        pyvista()
-    except wy.InputError as error:
-        pytest.skip(str(error))
     import imageio.v2 as imageio
 
     cloth = wy.paper.cloth(rows=5, columns=5, pose="flat")

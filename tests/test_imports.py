@@ -46,13 +46,13 @@ ONLY = {
     | {f"{W}.calibration.problem"},
     "pxr": {f"{W}.io.usd"},
     "h5py": {f"{W}.io.published"},
-    "pyvista": set(),
+    "viser": set(),
     "scenes": set(),
     "benchmarks": set(),
     "tests": set(),
     "common": set(),
 }
-"""Where a package may be imported at all; render.py asks for PyVista by name."""
+"""Where a package may be imported at all; view/ asks for viser by name."""
 
 BETWEEN_TERMS = {(f"{K}.terms.jamming", f"{K}.terms.stretch")}
 """The barrier between crossings takes k_s of the yarn from there."""
@@ -148,7 +148,7 @@ def test_importing_the_package_loads_no_extra():
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert {"warp", "warp_yarn", "numpy"} <= loaded
-    extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
+    extras = {"pxr", "torch", "viser", "imageio", "h5py", "scipy", "matplotlib", "newton"}
     assert not loaded & extras
 
 

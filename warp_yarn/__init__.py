@@ -20,7 +20,8 @@ from .presets import fabrics, paper
 from .registration import register_integrator, register_term, unregister_integrator, unregister_term
 from .simulation.simulator import Simulator
 from .simulation.state import State, Trajectory
-from .view.render import write_mp4, write_png
+from .view.camera import Camera
+from .view.render import steady_camera, write_mp4, write_png
 
 moved.install()
 
@@ -29,6 +30,7 @@ __version__ = importlib.metadata.version("warp_yarn")
 __all__ = [
     "WEAVES",
     "Box",
+    "Camera",
     "Capsule",
     "Cloth",
     "Cloths",
@@ -62,6 +64,7 @@ __all__ = [
     "sdirk",
     "unregister_integrator",
     "unregister_term",
+    "steady_camera",
     "write_mp4",
     "write_png",
     "write_usd",

@@ -90,19 +90,30 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
     if trajectory.scene is None:
         return []
     at = np.arange(len(trajectory)) if at is None else np.asarray(at)
-    points = trajectory.position
     result = []
     for obstacle in trajectory.scene.obstacles:
         position, rotation = _poses(obstacle, trajectory.start + at)
         width = length = 0.0
         if obstacle.shape == "plane":
             # a rectangle of its own, which moves as it does, under all of the cloth at all times
-            local = _turned(rotation[:, None] * BACK, points - position[:, None])[..., :2]
-            low, high = local.min(axis=(0, 1)), local.max(axis=(0, 1))
+            low, high = np.full(2, np.inf), np.full(2, -np.inf)
+            for k, when in enumerate(at.tolist()):
+                local = _turned(rotation[k] * BACK, between(trajectory.position, when) - position[k])[:, :2]
+                low, high = np.minimum(low, local.min(axis=0)), np.maximum(high, local.max(axis=0))
             width, length = (high - low + 2.0 * PLANE_MARGIN * (high - low).max()).tolist()
             position = position + _turned(rotation, np.append(0.5 * (low + high), 0.0))
         result.append(Placed(obstacle, position, rotation, width, length))
     return result
+
+
+def between(position: np.ndarray, at: float) -> np.ndarray:
+    """Gives positions [nodes, 3] at a frame, which need not be whole: in between along straight lines."""
+    before = min(int(at), len(position) - 1)
+    after = min(before + 1, len(position) - 1)
+    if before == at:
+        return position[before]
+    share = at - before
+    return (1.0 - share) * position[before] + share * position[after]
 
 
 def _poses(obstacle: Obstacle, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import os
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,7 @@ from ..io.files import atomic_write
 from ..simulation.state import Trajectory
 from . import raster
 from .camera import VIEW, Camera
-from .geometry import OBSTACLE_COLOR, Placed, checked, placed
+from .geometry import OBSTACLE_COLOR, Placed, between, checked, placed
 from .solids import solid
 from .yarns import Tubes, Weaving
 
@@ -164,14 +163,6 @@ def framed(
             yield np.clip(each.world(each.corners()).reshape(-1, 3), low - more, high + more)
 
     return Camera.framing(frames(), half, size[0] / size[1], view)
-
-
-def between(position: np.ndarray, at: float) -> np.ndarray:
-    """Gives positions [nodes, 3] at a frame, which need not be whole: in between along straight lines."""
-    before = min(int(at), len(position) - 1)
-    after = min(before + 1, len(position) - 1)
-    share = at - before
-    return (1.0 - share) * position[before] + share * position[after]
 
 
 class _Picture:
