@@ -26,6 +26,7 @@ FORBIDDEN = {
     f"{K}.nonlinear": {f"{K}.{room}" for room in ("terms", "linear", "stepping", "contact")},
     f"{K}.stepping": {f"{K}.terms", f"{K}.contact"},
     f"{K}.contact": {f"{K}.{room}" for room in ("terms", "nonlinear", "stepping")},
+    f"{K}.drawing": {f"{K}.{room}" for room in ("core", "terms", "linear", "nonlinear", "stepping", "contact")},
     f"{W}.description": {
         "warp", f"{W}.device", f"{W}.simulation", f"{W}.integrators", f"{W}.gradients", f"{W}.calibration", f"{W}.io",
         f"{W}.view", f"{W}.presets",
@@ -44,7 +45,7 @@ TERMS_BY_NAME = {f"{W}.description.scene"}
 ONLY = {
     "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "parts", "rollout", "run")}
     | {f"{W}.calibration.problem"},
-    "pxr": {f"{W}.io.usd"},
+    "pxr": {f"{W}.io.usd", f"{W}.io.usd_prims"},
     "h5py": {f"{W}.io.published"},
     "viser": set(),
     "scenes": set(),

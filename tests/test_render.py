@@ -87,10 +87,10 @@ def test_pictures_of_a_camera_that_stays_differ_where_the_cloth_is(tmp_path):
     assert np.array_equal(images[0], images[2])
     assert np.array_equal(images[3], np.broadcast_to(render.BACKGROUND, images[3].shape))
     on_cloth = [np.abs(image - images[3]).max(axis=2) > 8 for image in images]
-    assert 500 < (on_cloth[0] ^ on_cloth[1]).sum()
+    assert (on_cloth[0] ^ on_cloth[1]).sum() > 500
     for seen in on_cloth[:2]:
         rows, columns = np.nonzero(seen)
-        assert 0 < rows.min() and rows.max() < 119 and 0 < columns.min() and columns.max() < 159
+        assert rows.min() > 0 and rows.max() < 119 and columns.min() > 0 and columns.max() < 159
 
 
 def moved(trajectory, by):
@@ -235,7 +235,9 @@ def test_pictures_of_a_movie_are_along_straight_lines_between_frames():
     assert len(picture_times(1, 0.3)) == 1
 
 
-@pytest.mark.parametrize("progress, terminal, shown", [(False, True, 0), (True, False, 1), (None, True, 1), (None, False, 0)])
+@pytest.mark.parametrize(
+    "progress, terminal, shown", [(False, True, 0), (True, False, 1), (None, True, 1), (None, False, 0)]
+)
 def test_progress_bar_on_request_or_on_terminals(tmp_path, monkeypatch, capsys, progress, terminal, shown):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
     wy.write_mp4(tmp_path / "a.mp4", waving(frames=2), slowdown=100.0, size=(64, 48), progress=progress)
@@ -300,6 +302,9 @@ def test_absent_packages_are_named(tmp_path, monkeypatch, module):
     assert os.listdir(tmp_path) == []
 
 
+TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_solids_are_closed_face_outward_and_are_as_large_as_they_are(shape):
     """By the volume within their faces, and normals at right angles to the surface."""
@@ -313,7 +318,10 @@ def test_solids_are_closed_face_outward_and_are_as_large_as_they_are(shape):
         ),
         "cylinder": (wy.Cylinder(start=(0, 0, -half), end=(0, 0, half), radius=radius), np.pi * radius**2 * 2 * half),
         "box": (wy.Box(center=(0, 0, 0), half_extents=(0.5, 0.6, 0.7)), 8 * 0.5 * 0.6 * 0.7),
-        "mesh": (wy.TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]), 1 / 6),
+        "mesh": (
+            wy.TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]),
+            1 / 6,
+        ),
     }
     obstacle, volume = make[shape]
     placed = geometry.Placed(obstacle, np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]]), 1.0, 2.0)

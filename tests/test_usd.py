@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 from scripts import load
-from waving import BLUE, RED, rotation, waving
+from waving import BLUE, RED, waving
 
 import warp_yarn as wy
 from warp_yarn.io import usd
@@ -604,7 +604,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, tubes, 
     path = tmp_path / "a.usdc"
     if existing is not None:
         path.write_bytes(existing)
-    monkeypatch.setattr(usd, "_write_points", fails)
+    monkeypatch.setattr(usd, "write_points", fails)
     with pytest.raises(OSError, match="no space left"):
         wy.write_usd(path, waving(), tubes=tubes)
     assert os.listdir(tmp_path) == ([] if existing is None else ["a.usdc"])

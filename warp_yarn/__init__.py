@@ -4,7 +4,7 @@ import importlib
 import importlib.metadata
 from types import ModuleType
 
-from . import moved
+from . import moved, view
 from .description.cloth import Cloth, Yarn
 from .description.cloths import Cloths
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
@@ -62,9 +62,10 @@ __all__ = [
     "register_integrator",
     "register_term",
     "sdirk",
+    "steady_camera",
     "unregister_integrator",
     "unregister_term",
-    "steady_camera",
+    "view",
     "write_mp4",
     "write_png",
     "write_usd",

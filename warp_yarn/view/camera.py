@@ -78,16 +78,18 @@ class Camera:
         axes = _axes(toward, up)
         slope = np.tan(np.radians(0.5 * lens)) * np.array([aspect, 1.0])
         # what a point needs of distance, were it seen from over the origin, is linear on either side of it
-        lines = np.array([[s * MARGIN / slope[0], 0.0, 1.0] for s in (-1, 1)] + [[0.0, s * MARGIN / slope[1], 1.0] for s in (-1, 1)])
-        low, high, most = np.full(3, np.inf), np.full(3, -np.inf), np.full(4, -np.inf)
+        lines = np.array(
+            [[s * MARGIN / slope[0], 0.0, 1.0] for s in (-1, 1)] + [[0.0, s * MARGIN / slope[1], 1.0] for s in (-1, 1)]
+        )
+        low, top, most = np.full(3, np.inf), np.full(3, -np.inf), np.full(4, -np.inf)
         for points in frames:
             seen = points @ axes.T
-            low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
+            low, top = np.minimum(low, seen.min(axis=0)), np.maximum(top, seen.max(axis=0))
             most = np.maximum(most, (seen @ lines.T).max(axis=0))
-        centre = 0.5 * (low + high)
+        centre = 0.5 * (low + top)
         needs = most - lines @ centre + MARGIN * radius / slope[[0, 0, 1, 1]]
         # no nearer than the yarns, were they one point
-        distance = max(float(needs.max()), float(0.5 * (high - low)[2] + 4.0 * radius))
+        distance = max(float(needs.max()), float(0.5 * (top - low)[2] + 4.0 * radius))
         target = centre @ axes
         return cls(tuple(target + distance * axes[2]), tuple(target), tuple(up), lens)
 

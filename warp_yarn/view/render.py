@@ -126,9 +126,7 @@ def write_mp4(
                 writer.append_data(scene.drawn(frame))
 
 
-def steady_camera(
-    trajectory: Trajectory, *, size: Sequence[int] = (1280, 960), view: Sequence[float] = VIEW
-) -> Camera:
+def steady_camera(trajectory: Trajectory, *, size: Sequence[int] = (1280, 960), view: Sequence[float] = VIEW) -> Camera:
     """Finds a camera that has every frame of a trajectory in view, for pictures of several of them.
 
     Args:
@@ -211,11 +209,11 @@ class _Picture:
             centre, across = tubes.rings(places, normals)
             seen = {"centre": self.camera.seen(centre)[rings], "across": (across @ self.camera.axes.T)[rings]}
             surfaces.append(raster.tube(sides, faces, tubes.strands.color, half=tubes.half[rings], shade=shade, **seen))
-        for each, (vertices, out, faces) in zip(self.obstacles, self.solids, strict=True):
+        for each, (vertices, out, corners) in zip(self.obstacles, self.solids, strict=True):
             matrix = each.matrix(frame)
             surfaces.append(
                 raster.Surface(
-                    raster.on_device(faces, raster.wp.vec3i),
+                    raster.on_device(corners, raster.wp.vec3i),
                     raster.on_device(self.camera.seen(vertices @ matrix[:3, :3].T + matrix[:3, 3]), raster.wp.vec3),
                     raster.on_device(out @ matrix[:3, :3].T @ self.camera.axes.T, raster.wp.vec3),
                     raster.on_device(np.ones(len(vertices)), float),

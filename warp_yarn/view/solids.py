@@ -18,7 +18,7 @@ def solid(placed: Placed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Makes an obstacle in its own frame.
 
     Returns:
-        Vertices [vertices, 3] (m), unit normals [vertices, 3], and faces [faces, 3], counter-clockwise seen from outside.
+        Vertices [vertices, 3] (m), unit normals there, and faces [faces, 3], counter-clockwise seen from outside.
     """
     obstacle = placed.obstacle
     if isinstance(obstacle, TriangleMesh):
@@ -50,8 +50,8 @@ def solid(placed: Placed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _sides(corners: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Makes rectangles [rectangles, 4, 3] of their corners: the first, to the right, above it, and the last."""
-    first = 4 * np.arange(len(corners))[:, None, None]
-    return corners.reshape(-1, 3), np.repeat(normals, 4, axis=0), (first + [[0, 1, 3], [0, 3, 2]]).reshape(-1, 3)
+    faces = 4 * np.arange(len(corners))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])
+    return corners.reshape(-1, 3), np.repeat(normals, 4, axis=0), faces.reshape(-1, 3)
 
 
 def _revolved(profile: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

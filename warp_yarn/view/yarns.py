@@ -95,7 +95,7 @@ class Weaving:
             a, b = topology.segment_nodes[along == d].T
             self._before[d, b], self._after[d, a] = a, b
             self._yarn[d, a] = self._yarn[d, b] = topology.segment_yarn[along == d]
-        self.crossed = (self._yarn >= 0).all(axis=0)
+        self.crossed: np.ndarray = (self._yarn >= 0).all(axis=0)
         self._side = np.where(_flipped(cloth), -1.0, 1.0)
         self._half = sections(cloth)
         self._tips: list[tuple[int, int, float]] = []
@@ -185,7 +185,9 @@ class Weaving:
 
         def turns(piece: Piece) -> bool:
             """Tells whether it is a weft yarn with a free end at either side."""
-            return topology.yarn_direction[piece["yarn"]] == 1 and (piece["places"][[0, -1]] >= topology.nodes).all()
+            return bool(topology.yarn_direction[piece["yarn"]]) and bool(
+                piece["places"][[0, -1]].min() >= topology.nodes
+            )
 
         weft = [turns(piece) for piece in pieces]
         joined: Piece = {}
