@@ -63,12 +63,12 @@ def shade_vertices(
     if depth > 0.01 * distance:
         inverse = 1.0 / depth
     screen[v] = wp.vec3(middle[0] + focal * p[0] * inverse, middle[1] - focal * p[1] * inverse, inverse)
-    side = 1.0
+    side = float(1.0)
     if two_sided != 0 and wp.dot(normal[v], eye) < 0.0:
         side = -1.0
     n = normal[v] * side
     toward = wp.normalize(eye)
-    diffuse, shine = 0.15, 0.0
+    diffuse, shine = float(0.15), float(0.0)
     for k in range(lamps.shape[0]):
         way = wp.vec3(lamps[k][0], lamps[k][1], lamps[k][2])
         facing = wp.dot(n, way)
@@ -147,7 +147,7 @@ def average(
 ):
     """Average samples × samples."""
     y, x = wp.tid()
-    r, g, b = 0, 0, 0
+    r, g, b = int(0), int(0), int(0)
     for j in range(samples):
         for i in range(samples):
             value = int(image[(y * samples + j) * width + x * samples + i])

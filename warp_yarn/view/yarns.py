@@ -95,7 +95,7 @@ class Weaving:
             a, b = topology.segment_nodes[along == d].T
             self._before[d, b], self._after[d, a] = a, b
             self._yarn[d, a] = self._yarn[d, b] = topology.segment_yarn[along == d]
-        self.crossed: np.ndarray = (self._yarn >= 0).all(axis=0)
+        self.crossed = np.logical_and(*(self._yarn >= 0))
         self._side = np.where(_flipped(cloth), -1.0, 1.0)
         self._half = sections(cloth)
         self._tips: list[tuple[int, int, float]] = []
