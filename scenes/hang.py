@@ -111,7 +111,7 @@ def write(trajectory: wy.Trajectory, options: argparse.Namespace) -> None:
     if options.png is not None:
         writers.append(lambda: wy.write_png(options.png, trajectory))
     if options.mp4 is not None:
-        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
+        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=None))
     write_all(trajectory, *writers)
 
 

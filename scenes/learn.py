@@ -36,7 +36,7 @@ from warp_yarn.calibration.learn import PAPER, CalibrationProblem, Parameter, Re
 from warp_yarn.errors import integer
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.io.files import atomic_write
-from warp_yarn.io.usd import ENDINGS, reload, writing
+from warp_yarn.io.usd import LAYERS, reload, writing
 from warp_yarn.presets import paper
 from warp_yarn.simulation.state import FIELDS
 
@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     add("--iterations", type=int, default=100, help="at most (%(default)s)")
     add("--resolution", type=float, default=1e-9, metavar="METRES", help="of the data, at best (%(default)g)")
     add("--resume", action="store_true", help="go on where the same command was stopped")
-    add("--output", type=file_ending(*ENDINGS), default=Path("out/learn.usdc"), metavar="USD", help="(%(default)s)")
+    add("--output", type=file_ending(*LAYERS), default=Path("out/learn.usdc"), metavar="USD", help="(%(default)s)")
     add("--plot", type=file_ending(".png"), metavar="PNG", help="(the USD file's name, .png)")
     add("--result", type=file_ending(".json"), metavar="JSON", help="(the USD file's name, .json)")
     add_slowdown(result)

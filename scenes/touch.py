@@ -112,7 +112,7 @@ def finish(run: Run, options: argparse.Namespace, *told: str) -> wy.Trajectory:
     if options.png is not None:
         writers.append(lambda: wy.write_png(options.png, trajectory, size=(960, 720)))
     if options.mp4 is not None:
-        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
+        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=None))
     write_all(trajectory, *writers)
     cloth = trajectory.cloth
     for weave in [each.weave for each in (cloth.cloths if isinstance(cloth, wy.Cloths) else [cloth])]:

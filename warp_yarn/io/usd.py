@@ -20,7 +20,8 @@ from .usd_prims import Curves, Shape, Surface, TubeMesh, bind, linear, material,
 if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
     from pxr import UsdGeom
 
-ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+LAYERS = (".usd", ".usda", ".usdc")
+ENDINGS = (*LAYERS, ".usdz")
 COARSE = 1e-4
 PENDING = 1 << 26
 """Bytes of frames that are kept in memory until they are written."""
