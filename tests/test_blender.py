@@ -28,7 +28,8 @@ import numpy as np
 
 frames = json.loads(sys.argv[2])
 scene = bpy.context.scene
-found = {"fps": scene.render.fps / scene.render.fps_base, "end": scene.frame_end, "scale": scene.unit_settings.scale_length}
+found = {"fps": scene.render.fps / scene.render.fps_base, "end": scene.frame_end}
+found["scale"] = scene.unit_settings.scale_length
 found["shapes"] = [scene.cycles_curves.shape, scene.render.hair_type]
 for frame in frames:
     scene.frame_set(int(frame), subframe=frame % 1.0)
@@ -64,7 +65,8 @@ def imported(tmp_path_factory):
 
     def found(path, frames):
         # of an empty scene, as Blender has its cube, lamp and camera
-        start = "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); exec(open(__import__('sys').argv.pop(1)).read())"
+        empty = "import bpy, sys; bpy.ops.wm.read_factory_settings(use_empty=True)"
+        start = f"{empty}; exec(open(sys.argv.pop(1)).read())"
         arguments = [BLENDER, "-c", start, str(script), str(path), json.dumps(frames)]
         done = subprocess.run(arguments, capture_output=True, text=True)
         assert done.returncode == 0 and "FOUND" in done.stdout, done.stderr

@@ -355,8 +355,10 @@ def squeezed(
 
 def sections(cloth: Cloth | Cloths) -> np.ndarray:
     """Gives half the width and half the height of every yarn's section [yarns, 2] (m)."""
-    radius = np.broadcast_to(np.asarray(cloth.radius, dtype=float), (len(cloth.material),))
-    return np.stack([radius, radius], axis=1)
+    halves = getattr(cloth, "halves", None)  # of cloths whose yarns have a width and a thickness each
+    if halves is not None:
+        return np.asarray(halves)
+    return np.full((len(cloth.material), 2), cloth.radius)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
