@@ -10,6 +10,7 @@ import functools
 import warp as wp
 
 from .contact import broad_phase, limits, meshes, obstacles, self_contact
+from .core import general
 from .core.variant import Term, TermParameter, Variant
 from .linear import (
     block_matrix,
@@ -23,6 +24,8 @@ from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, 
 from .terms import (
     applied_force,
     bending,
+    crimp_interchange,
+    crimped_contact,
     crossing_normal,
     friction,
     gravity,
@@ -41,6 +44,7 @@ _OWN = (
     inertia.INERTIA,
     inertia.MASS_RATE,
     stretch.TERM,
+    crimp_interchange.TERM,
     bending.TERM,
     gravity.TERM,
     jamming.TERM,
@@ -109,6 +113,8 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
 
     All at once, since a kernel that is added to a Warp module after its first launch compiles the whole module again.
     """
+    if variant.general:
+        return _build_general(variant)
     variant.fuse("terms")
     # Nodes on one line have products that cancel to the last digit. Contracted, as CUDA's compiler does by itself, one
     # of two is rounded and the other not, and there is a normal of 1e-46 where there is none.
@@ -117,13 +123,14 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         "contact_normal": crossing_normal.define_normal(variant),
         "update_anchor": friction.define_anchor(variant),
     }
+    kernels |= vars(crimped_contact.define(variant))
     for term in _OWN:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
     for part in (linear, ros2):
         kernels |= vars(part.define_reversible(variant))
-    kernels |= vars(limits.define_motion(variant))
+    kernels |= vars(limits.define_motion(variant)) | vars(newton.define_turning(variant.forward))
     for reports in (obstacles.define_reports, meshes.define_search, self_contact.define_limits):
         kernels |= vars(reports(variant.forward))
     for part in (
@@ -145,4 +152,19 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         ros2,
     ):
         kernels |= vars(part.define(variant.forward))
+    return kernels
+
+
+def _build_general(variant: Variant) -> dict[str, wp.Kernel]:
+    """Define the kernels of general cloths: those that read a cloth's numbers anew, and the others of plain cloths."""
+    kernels = dict(_build(variant.plain))
+    variant.fuse("terms")
+    for term in _OWN:
+        if general.reads(kernels[term.name]):
+            kernels[term.name] = term.define(variant)
+            if term.energy is not None:
+                kernels[f"{term.name}_energy"] = term.energy(variant.forward)
+    kernels["update_anchor"] = friction.define_anchor(variant)
+    kernels |= vars(crimped_contact.define(variant))
+    kernels |= vars(ros2.define_reversible(variant)) | vars(newton.define_turning(variant.forward))
     return kernels

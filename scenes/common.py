@@ -14,8 +14,11 @@ from typing import Any
 import warp as wp
 
 import warp_yarn as wy
+from warp_yarn.description.weave import woven
 from warp_yarn.errors import integer, real
+from warp_yarn.io.draft import ENDINGS
 from warp_yarn.io.files import check_writable
+from warp_yarn.presets.fabrics import FABRICS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +92,35 @@ def file_ending(*endings: str) -> Callable[[str], Path]:
         return Path(text)
 
     return path
+
+
+def add_weave(parser: argparse.ArgumentParser) -> None:
+    """The options --weave and --draft of what weaves a cloth."""
+
+    def words(text: str) -> str:
+        try:
+            woven(text, rows=3, columns=3)
+        except wy.InputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        return text
+
+    text = f'{", ".join(wy.WEAVES)} (the paper\'s), or words such as "2/2 twill Z" and "satin 5/2" (plain)'
+    parser.add_argument("--weave", type=words, metavar="WORDS", help=text)
+    text = "a weaver's draft, .wif, .dtx or .wpo: its weave, repeated or cut to the size, and its colours"
+    parser.add_argument("--draft", type=file_ending(*ENDINGS, *map(str.upper, ENDINGS)), metavar="FILE", help=text)
+
+
+def woven_cloth(fabric: str, options: argparse.Namespace, rows: int, columns: int, **more: Any) -> wy.Cloth:
+    """A cloth of a fabric, woven as --weave or --draft say."""
+    make = FABRICS[fabric]
+    if options.draft is None:
+        return make(weave=options.weave or "plain", rows=rows, columns=columns, **more)
+    if options.weave is not None:
+        raise wy.InputError(f"--weave = {options.weave} does not go with --draft, which has its own")
+    draft = wy.read_draft(options.draft).tiled(rows=rows, columns=columns)
+    cloth = make(weave=draft.weave, rows=rows, columns=columns, **more)
+    colored = draft.warp_colors is not None and draft.weft_colors is not None
+    return draft.dyed(cloth) if colored else cloth
 
 
 def add_slowdown(parser: argparse.ArgumentParser) -> None:

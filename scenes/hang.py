@@ -3,6 +3,7 @@
 python scenes/hang.py                                     the paper's, 17 × 17, plain, 500 × 1 ms: out/hang.usdc
 python scenes/hang.py --fabric handkerchief               one that you might have at hand
 python scenes/hang.py --size 31 --weave twill --yarns 1 3 --png out/hang.png --mp4 out/hang.mp4
+python scenes/hang.py --weave "3/1 twill S"               as weavers say it; or --draft FILE.wif, as they draw it
 python scenes/hang.py --record out/hang.npz               and later, to go on from there:
 python scenes/hang.py --resume out/hang.npz --steps 500 --output out/both.usdc
 """
@@ -15,14 +16,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from common import Run, add_slowdown, command, file_ending, make_folders, simulate, write_all
+from common import Run, add_slowdown, add_weave, command, file_ending, make_folders, simulate, woven_cloth, write_all
 
 import warp_yarn as wy
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
 
-OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "yarns", "wind", "step", "locked")
+OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "draft", "yarns", "wind", "step", "locked")
 """Options that a recording settles, where one is resumed."""
 
 
@@ -35,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     add("--size", type=int, metavar="N", help="rows and columns (17)")
     add("--rows", type=int, help="number of warp yarns, at least 3")
     add("--columns", type=int, help="number of weft yarns, at least 3")
-    add("--weave", choices=wy.WEAVES, help="(plain)")
+    add_weave(result)
     add("--yarns", type=int, nargs=2, metavar=("EVEN", "ODD"), help="two of the paper's yarns 1, 2 and 3 (1 2)")
     add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m/s (0 5 0)")
     add("--steps", type=int, default=paper.STEPS, help="how many (%(default)s)")
@@ -88,7 +89,7 @@ def chosen(options: argparse.Namespace) -> tuple[wy.Scene, float]:
     if options.yarns is not None and fabric != "paper":
         raise wy.InputError(f"--yarns = {' '.join(map(str, options.yarns))} are the paper's: not of --fabric {fabric}")
     yarns = {} if options.yarns is None else {"yarns": options.yarns}
-    cloth = FABRICS[fabric](weave=options.weave or "plain", rows=rows, columns=columns, **yarns)
+    cloth = woven_cloth(fabric, options, rows, columns, **yarns)
     wind = wy.Wind(velocity=tuple(options.wind or paper.WIND))
     return paper.hung(cloth, wind=wind, sliding=not options.locked), step
 

@@ -157,7 +157,8 @@ def chosen(scene: wy.Scene, options: argparse.Namespace) -> list[Parameter]:
     ranges = {name: tuple(read_number(f"--range {name}", text) for text in ends) for name, *ends in options.range}
     starts = {name: read_number(f"--start {name}", text) for name, text in options.start}
     counts = learnable(scene)
-    own = [name for name in known if counts[split(name)[0]] is None or split(name)[1] < counts[split(name)[0]]]
+    places = {name: split(name) for name in known}
+    own = [name for name, (base, k) in places.items() if (counts[base] is None if k is None else k < counts[base])]
     names = options.parameters or own
     for option, given in (("--range", ranges), ("--start", starts)):
         for name in given:

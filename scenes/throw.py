@@ -3,6 +3,7 @@
 python scenes/throw.py                                    a velocity: out/throw.usdc, out/throw.png, out/throw.json
 python scenes/throw.py --forces                           forces on the four corners in the first five steps instead
 python scenes/throw.py --size 17 --weave twill --target 0.1 0 0.3 --time 0.3
+python scenes/throw.py --box                              from a table into a box; --box --help lists its options
 
 The cloth lies flat and is free, gravity acts, there is no wind. The target is where the mean of its nodes shall be,
 relative to where it starts. Ctrl-C ends the search and writes the best throw so far. Needs the extras torch and bench.
@@ -19,10 +20,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import into_box
 import numpy as np
 import torch
 import tqdm
-from common import add_slowdown, command, file_ending, make_folders, write_all
+from common import add_slowdown, add_weave, command, file_ending, make_folders, woven_cloth, write_all
 from matplotlib.figure import Figure
 
 import warp_yarn as wy
@@ -209,11 +211,12 @@ def parser() -> argparse.ArgumentParser:
     add = result.add_argument
     add("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     add("--size", type=int, default=9, metavar="N", help="rows and columns (%(default)s)")
-    add("--weave", choices=wy.WEAVES, default="plain", help="(%(default)s)")
+    add_weave(result)
     add("--target", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0.3, 0.1, 0.2), help="m (0.3 0.1 0.2)")
     add("--time", type=float, default=0.25, metavar="SECONDS", help="until it shall be there (%(default)s)")
     add("--steps", type=int, default=250, help="time steps in it (%(default)s)")
     add("--forces", action="store_true", help=f"learn forces on the corners in the first {PUSHED} steps")
+    add("--box", action="store_true", help="throw from a table into a box, with options of its own")
     add("--iterations", type=int, default=50, help="at most (%(default)s)")
     add("--rate", type=float, default=1.0, help="learning rate of the optimizer, L-BFGS (%(default)g)")
     add("--within", type=float, default=1e-6, metavar="METRES", help="near enough to end (%(default)g)")
@@ -235,6 +238,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         InputError: an option that cannot be used.
         SimulationError, KeyboardInterrupt: what ended the search, after the best throw before was written.
     """
+    if "--box" in (sys.argv[1:] if arguments is None else arguments):
+        return into_box.main(arguments)
     options = parser().parse_args(arguments)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
@@ -242,8 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     real("--rate", options.rate, above=0.0)
     real("--within", options.within, least=0.0)
     make_folders([options.output, options.plot, options.result])
-    make = FABRICS[options.fabric]
-    cloth = make(weave=options.weave, rows=options.size, columns=options.size, pose="flat")
+    cloth = woven_cloth(options.fabric, options, options.size, options.size, pose="flat")
     throw = Throw(
         cloth,
         options.target,

@@ -9,7 +9,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from common import Run, add_slowdown, file_ending, make_folders, read_number, simulate, write_all
+from common import (
+    Run,
+    add_slowdown,
+    add_weave,
+    file_ending,
+    make_folders,
+    read_number,
+    simulate,
+    woven_cloth,
+    write_all,
+)
 
 import warp_yarn as wy
 from warp_yarn.errors import integer
@@ -31,7 +41,7 @@ def parser(text: str | None, name: str, *, rows: int, columns: int, steps: int) 
     add("--fabric", choices=FABRICS, default="paper", help="(%(default)s)")
     add("--rows", type=int, default=rows, help="number of warp yarns (%(default)s)")
     add("--columns", type=int, default=columns, help="number of weft yarns (%(default)s)")
-    add("--weave", choices=wy.WEAVES, default="plain", help="(%(default)s)")
+    add_weave(result)
     add("--friction", type=float, default=0.3, metavar="MU", help="of all that touches (%(default)s)")
     add("--integrator", choices=INTEGRATORS, default="implicit-euler", help="(%(default)s)")
     add("--steps", type=int, default=steps, help="how many (%(default)s)")
@@ -67,7 +77,7 @@ def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argp
 
 def flat(options: argparse.Namespace) -> wy.Cloth:
     """The cloth of the options, flat, its middle in the origin."""
-    cloth = FABRICS[options.fabric](weave=options.weave, rows=options.rows, columns=options.columns, pose="flat")
+    cloth = woven_cloth(options.fabric, options, options.rows, options.columns, pose="flat")
     return cloth.replace(pose=cloth.position - cloth.position.mean(axis=0))
 
 

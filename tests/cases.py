@@ -22,7 +22,23 @@ YARNS = (
 GRAVITY = (0.4, -0.7, -9.8)
 WIND = wy.Wind(velocity=(1.0, 5.0, -0.5))
 
-CLOTHS = ("plain", "twill", "satin")
+GENERAL = {
+    "yarns": (
+        dataclasses.replace(YARNS[0], width=8.6e-4, thickness=3.4e-4),
+        dataclasses.replace(YARNS[1], radius=2.7e-4),
+        YARNS[2],
+    ),
+    "radius": 3.2e-4,
+    "spacing": ([0.9e-3, 0.82e-3, 1.26e-3, 0.75e-3], [1.1e-3, 0.72e-3, 0.97e-3, 1.4e-3, 1.03e-3]),
+    "crimp": ([0.02, 0.0, 0.05, 0.01, 0.03], 0.04),
+    "shear": [[700.0, 400.0, 900.0], [500.0, 1200.0, 300.0], [800.0, 600.0, 1000.0]],
+    "friction": np.linspace(0.3, 0.6, 30),
+    "friction_stiffness": [[1000.0, 800.0, 1200.0], [900.0, 1100.0, 700.0], [600.0, 1300.0, 500.0]],
+    "friction_damping": np.linspace(0.08, 0.12, 30),
+    "pose": "flat",
+}
+"""Of a cloth with a number of its own wherever it may have one."""
+CLOTHS = ("plain", "twill", "satin", "general")
 STATES = ("rest", "random", "stretched", "slack", "folded")
 BENT = ("random", "slack", "folded")
 """States in which no yarn is straight."""
@@ -38,10 +54,12 @@ def cloth(name: str) -> wy.Cloth:
         "plain": dict(yarns=YARNS[:2], radius=4.8e-4, pose="flat"),
         "twill": dict(yarns=YARNS[1:], radius=4.5e-4, shear=200.0),
         "satin": dict(yarns=YARNS[::2], spacing=1.1e-3, shear=700.0, friction=0.3, parallel_stiffness=2.0),
+        "general": dict(GENERAL),
     }[name]
-    rows, columns = {"plain": (5, 5), "twill": (6, 6), "satin": (4, 7)}[name]
+    rows, columns = {"plain": (5, 5), "twill": (6, 6), "satin": (4, 7), "general": (5, 6)}[name]
+    weave = wy.WEAVES["plain" if name == "general" else name](rows=rows, columns=columns)
     # A damping whose force is of the size of friction's spring; the paper's would hide it.
-    return wy.Cloth(wy.WEAVES[name](rows=rows, columns=columns), friction_damping=0.1, **options)
+    return wy.Cloth(weave, **{"friction_damping": 0.1, **options})
 
 
 @functools.cache
@@ -76,10 +94,13 @@ def oracle(name: str, terms: tuple[str, ...] | None, sliding: bool = True, publi
 # -- states ----------------------------------------------------------------------------------------------------------
 
 
-def _lines(rng: np.random.Generator, count: int, spacing: float, name: str) -> np.ndarray:
+def _lines(rng: np.random.Generator, at_rest: np.ndarray, name: str) -> np.ndarray:
     """Where the straight lines of crossings stand."""
-    steps = {"stretched": rng.uniform(1.1, 1.5, count - 1), "slack": np.full(count - 1, 0.7)}
-    return np.concatenate([[0.0], np.cumsum(steps.get(name, np.ones(count - 1)))]) * spacing
+    count = len(at_rest) - 1
+    steps = {"stretched": rng.uniform(1.1, 1.5, count), "slack": np.full(count, 0.7)}
+    if name not in steps:
+        return at_rest
+    return np.concatenate([[0.0], np.cumsum(steps[name] * np.diff(at_rest))])
 
 
 def make_state(c: wy.Cloth, name: str, sliding: bool = True) -> wy.State:
@@ -95,14 +116,11 @@ def make_state(c: wy.Cloth, name: str, sliding: bool = True) -> wy.State:
     squeezed    random, with neighbouring crossings, and a crossing and the end of its yarn, within 0.1 R along the yarn
     """
     rng = np.random.default_rng(zlib.crc32(f"{c.weave.name} {name}".encode()))
-    rows, columns, length = c.weave.rows, c.weave.columns, c.spacing
+    rows, columns, length = c.weave.rows, c.weave.columns, c.shortest_spacing
     rest = c.position.reshape(rows, columns, 3)
-    along, across = (rest[0, 1] - rest[0, 0]) / length, (rest[1, 0] - rest[0, 0]) / length
-    x = (
-        rest[0, 0]
-        + _lines(rng, columns, length, name)[None, :, None] * along
-        + _lines(rng, rows, length, name)[:, None, None] * across
-    )
+    u, v = c.rest_grid.reshape(rows, columns, 2)[0, :, 0], c.rest_grid.reshape(rows, columns, 2)[:, 0, 1]
+    along, across = (rest[0, 1] - rest[0, 0]) / u[1], (rest[1, 0] - rest[0, 0]) / v[1]
+    x = rest[0, 0] + _lines(rng, u, name)[None, :, None] * along + _lines(rng, v, name)[:, None, None] * across
     jitter = {"slack": 0.04, "folded": 0.04, "rest": 0.0, "stretched": 0.0, "flat": 0.0}.get(name, 0.15)
     x = x + rng.uniform(-jitter, jitter, x.shape) * length
     if name in ("folded", "flat"):
@@ -117,9 +135,10 @@ def make_state(c: wy.Cloth, name: str, sliding: bool = True) -> wy.State:
     moving = name not in ("rest", "flat")
     euler = c.euler + rng.uniform(-0.08, 0.08, (c.nodes, 2)) * length * inside * moving
     if name == "squeezed":
-        euler[c.node(1, 2), 0] = euler[c.node(1, 1), 0] + 0.1 * c.radius
-        euler[c.node(2, -2), 0] = euler[c.node(2, -1), 0] - 0.02 * c.radius
-        euler[c.node(1, 1), 1] = 0.05 * c.radius
+        half = c.halves[:, 0].min()
+        euler[c.node(1, 2), 0] = euler[c.node(1, 1), 0] + 0.1 * half
+        euler[c.node(2, -2), 0] = euler[c.node(2, -1), 0] - 0.02 * half
+        euler[c.node(1, 1), 1] = 0.05 * half
     velocity = rng.normal(0.0, 0.5, (c.nodes, 3)) * moving
     euler_velocity = rng.normal(0.0, 0.2, (c.nodes, 2)) * inside * moving
     anchor = euler + rng.uniform(-5e-5, 5e-5, (c.nodes, 2)) * inside * moving

@@ -29,17 +29,18 @@ def natural(c: wy.Cloth, term: str) -> float:
 
     A state may have no force of a term at all, or the small difference of large ones.
     """
-    area, length = np.pi * c.radius**2, c.spacing
+    area, length = np.pi * c.halves.prod(axis=1).max(), c.longest_spacing
     density = max(yarn.density for yarn in c.yarns)
     return {
         "stretch": max(yarn.stretch for yarn in c.yarns) * area,
+        "crimp_interchange": max(yarn.stretch for yarn in c.yarns) * area,
         "bending": max(yarn.bend for yarn in c.yarns) * area / length**2,
-        "shear": c.shear * area,
+        "shear": np.max(c.shear) * area,
         "gravity": density * length * 9.8,
         "parallel": c.parallel_stiffness * length**2,
         "wind": WIND.density * length**2 * 25.0,
         "pins": 1e4 * length,
-        "friction": c.friction_stiffness * 1e-5,
+        "friction": np.max(c.friction_stiffness) * 1e-5,
         "applied": 1e-4,
         "inertia": density * SPEED**2,
         "mass_rate": density * SPEED**2,
@@ -110,7 +111,7 @@ class TermChecks:
 
     def least_of_matrix(self, case: Case) -> float:
         """A stiffness, or a damping where the term has that."""
-        return self.least(case) / case.cloth.spacing
+        return self.least(case) / case.cloth.longest_spacing
 
     def matrix(self, case: Case, part: str) -> np.ndarray:
         """What the term adds to a part of the matrix."""
@@ -141,7 +142,7 @@ class TermChecks:
         expected = torch.func.vmap(along)(*torch.split(tensor(directions), [5 * n, 5 * n, 2 * n], dim=1))
         force = functools.partial(force_of, sim, self.term)
         actual = [difference(case, direction, self.step, force) for direction in directions]
-        assert error(actual, expected, self.least(case) / case.cloth.spacing) < self.tolerance_of_differences
+        assert error(actual, expected, self.least(case) / case.cloth.longest_spacing) < self.tolerance_of_differences
 
     def test_matrix(self, case: Case) -> None:
         """Symmetric, positive semi-definite, and what the term's docstring says."""
@@ -176,7 +177,7 @@ class EnergyChecks(TermChecks):
     def test_energy(self, case: Case) -> None:
         """The oracle's."""
         actual = self.simulator(case).energy(case.state)[self.energy or self.term]
-        assert error(actual, self.oracle_energy(case), self.least(case) * case.cloth.spacing) < self.tolerance
+        assert error(actual, self.oracle_energy(case), self.least(case) * case.cloth.longest_spacing) < self.tolerance
 
     def test_force_is_minus_the_gradient_of_the_energy(self, case: Case) -> None:
         """Of the kernel's own, by central differences along random directions."""
@@ -196,5 +197,5 @@ class InternalChecks(EnergyChecks):
         force, _ = self.simulator(case).forces(case.state)[self.term]
         x = case.state.position
         assert error(force.sum(axis=0), np.zeros(3), np.abs(force).max() + self.least(case)) < self.tolerance
-        size = np.abs(x).max() * np.abs(force).max() + self.least(case) * case.cloth.spacing
+        size = np.abs(x).max() * np.abs(force).max() + self.least(case) * case.cloth.longest_spacing
         assert error(np.cross(x, force).sum(axis=0), np.zeros(3), size) < self.tolerance

@@ -4,9 +4,10 @@
     python tests/compile_cuda.py --arch 75 --cubin  all variants, to the machine code of another GPU
 
 PTX (the default) shows that the generated C++ compiles, --cubin also that it assembles. --quick compiles two of the
-four forward variants and their reverses, single precision with sliding and double without: between them every line of
-every kernel, and every snippet at both precisions. What is compiled lies in Warp's cache by its content, so that a
-second run compiles what has changed. The compiler's messages are on stderr, and name lines of the generated source.
+four forward variants and their reverses, each of general cloths too, single precision with sliding and double without:
+between them every line of every kernel, and every snippet at both precisions. What is compiled lies in Warp's cache by
+its content, so that a second run compiles what has changed. The compiler's messages are on stderr, and name lines of
+the generated source.
 
 It stands beside the tests since it checks and measures nothing, and is none of them since it takes a minute from an
 empty cache.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import dataclasses
 import itertools
 import os
 import sys
@@ -23,18 +25,22 @@ from collections.abc import Iterable, Sequence
 
 import warp as wp
 from warp_yarn.kernels import Variant, build
+from warp_yarn.kernels.contact import continuous
 
 
 def variants(quick: bool) -> list[Variant]:
     """List what is compiled, the longest first."""
     kinds = itertools.product((wp.float64, wp.float32), (False, True))
     chosen = [(scalar, sliding) for scalar, sliding in kinds if not quick or (scalar is wp.float32) == sliding]
-    return [Variant(*kind, reverse) for reverse in (True, False) for kind in chosen]
+    every = [Variant(*kind, reverse) for reverse in (True, False) for kind in chosen]
+    return [variant for plain in every for variant in (plain, dataclasses.replace(plain, general=True))]
 
 
 def modules(variants: Iterable[Variant]) -> list[str]:
     """Name the Warp modules of all kernels of these variants, each once."""
     kernels = itertools.chain.from_iterable(build(variant).values() for variant in variants)
+    # these are of no variant
+    kernels = itertools.chain(kernels, [continuous.define().find_vertices])
     return list(dict.fromkeys(kernel.module.name for kernel in kernels))
 
 

@@ -41,9 +41,11 @@ def scaled(rollout: wt.Rollout, names: tuple[str, ...], fixed: dict[str, torch.T
     for name in names:
         value = fixed.get(name)
         if value is None and name in ("density", "stretch", "bend"):
-            value = torch.tensor([getattr(yarn, name) for yarn in YARNS], dtype=torch.float64)
+            value = torch.tensor([getattr(yarn, name) for yarn in rollout.scene.cloth.yarns], dtype=torch.float64)
+        elif value is None and name in rollout.of_crossings:
+            value = torch.tensor(np.array(getattr(rollout.scene.cloth, name)))
         elif value is None:
-            value = rollout.defaults[name.removeprefix("yarn_")]
+            value = rollout.defaults[name.removeprefix("yarn_").removeprefix("node_")]
         scale = {"euler": 1e-4, "anchor": 1e-7, "position": 1e-4, "velocity": 0.1, "euler_velocity": 0.01}.get(
             name, float(value.abs().max()) or 1.0
         )

@@ -15,8 +15,10 @@ import warp_yarn as wy
 from warp_yarn.calibration.problem import CalibrationProblem
 from warp_yarn.device import exclusive, graphs
 from warp_yarn.device.contact import Near
+from warp_yarn.device.impact_zones import Projected
 from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
+from warp_yarn.simulation.linear_system import read_system
 from warp_yarn.view import render
 
 # -- a simulator's arrays ---------------------------------------------------------------------------------------------
@@ -32,6 +34,20 @@ def put(simulator: wy.Simulator, name: str, values: object) -> None:
     """Writes into an array that kernels use; one number goes everywhere."""
     array = simulator.arrays[name]
     array.assign(np.broadcast_to(np.asarray(values), array.numpy().shape))
+
+
+def stiffness_at_evaluation(simulator: wy.Simulator, state: wy.State, evaluations: int) -> np.ndarray:
+    """H of the matrix that Newton's iteration has after so many evaluations in a stage."""
+    simulator.state = state
+    simulator.arrays.put("evaluations", evaluations)
+    simulator.arrays.put("coefficients", 0.0, 0.0, 1.0)
+    simulator.model.assemble()
+    return read_system(simulator.model).dense()
+
+
+def has_any(simulator: wy.Simulator, *names: str) -> bool:
+    """Whether the simulator knows any array of these names at all."""
+    return bool(set(names) & set(simulator.arrays))
 
 
 def add_array(simulator: wy.Simulator, name: str, array: str | None) -> None:
@@ -241,3 +257,16 @@ halved: Callable = ablation._halved
 unneeded: Callable = ablation._unneeded
 picture_times: Callable = render._times
 Picture = render._Picture
+
+
+def resolved_with_its_adjoint(
+    simulator: wy.Simulator, start: np.ndarray, end: np.ndarray, inverse_mass: np.ndarray, adjoint: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[list[int]]]:
+    """What impact zones do to a way: where it ends, adjoints of its start and end by one of the move, and how many
+    impacts are active in each zone of each round."""
+    zones = simulator.model.zones
+    found, rounds = zones.resolve(start, end, inverse_mass)
+    active = [[len(zone.multipliers) for zone in one.zones] for one in rounds]
+    made = Projected(rounds, start, inverse_mass, np.zeros(0), found - end, 1.0)
+    to_start, to_end, _ = zones.taken_back(made, adjoint)
+    return found, to_start, to_end, active

@@ -26,6 +26,7 @@ terms = load("benchmarks/terms.py")
 terms_scene = load("scenes/terms.py")
 defaults = load("benchmarks/defaults.py")
 iterations = load("benchmarks/iterations.py")
+tensile = load("benchmarks/tensile_curve.py")
 motions = beside(work, "motions")
 
 
@@ -781,3 +782,28 @@ def test_the_tables_of_iterations_from_the_command(tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert [row["table"] for row in rows] == ["hung"] * 4 + ["stretch"] * 2 + ["jittered"] * 6
     assert all(0 < int(row["multilevel, stage, to r"]) < 60 for row in rows)
+
+
+# -- benchmarks/tensile_curve.py --------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_tensile_curve_has_leaf_and_kandil_s_slope_and_then_the_yarns_own():
+    cloth = tensile.strip(5, 9, (0.05, 0.05))
+    strains = (0.0, 1e-4, 0.07, 0.07 + 1e-4)
+    # long beside the clamps, which keep the ends from drawing in
+    free = tensile.curve(cloth, strains, interchange=True, clamped=False)
+    rest, small, large, more = (row["force per width [N/m]"] for row in free)
+    assert abs(rest) < 1e-6
+    assert tensile.leaf_kandil((0.05, 0.05)) == pytest.approx(1784.6, rel=1e-3)
+    assert 0.9 < small / 1e-4 / tensile.leaf_kandil((0.05, 0.05)) < 2.0
+    own = tensile.STRETCH / tensile.DISTANCE
+    assert 0.7 * own < (more - large) / 1e-4 < own
+    assert free[2]["strain across"] < -0.05
+    held = tensile.curve(cloth, strains[:2], interchange=True, clamped=True)
+    straight = tensile.curve(cloth, strains[:2], interchange=False, clamped=False)
+    assert small < held[1]["force per width [N/m]"] < straight[1]["force per width [N/m]"]
+    # as stretch has it, from the start
+    assert straight[1]["force per width [N/m]"] / 1e-4 == pytest.approx(1.05 * own, rel=1e-3)
+    figure = tensile.draw([{"kind": kind, **row} for kind in tensile.KINDS for row in free], (0.05, 0.05))
+    assert len(figure.axes) == 2

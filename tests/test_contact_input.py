@@ -71,7 +71,7 @@ def test_scenes_refuse_what_is_no_obstacle() -> None:
         wy.Scene(paper(4, 4), contact={"friction": 0.3})
     with pytest.raises(wy.InputError, match="terms names 'obstacles', but there is no obstacle"):
         wy.Scene(paper(4, 4), terms=["obstacles"])
-    with pytest.raises(wy.InputError, match="terms names 'self_contact', but self_contact is False"):
+    with pytest.raises(wy.InputError, match="terms names 'self_contact', but there is no self_contact by a barrier"):
         wy.Scene(paper(4, 4), terms=["self_contact"])
 
 
@@ -161,8 +161,8 @@ def test_cloths_apart_are_each_alone(method: str) -> None:
 def test_several_cloths_have_one_thread() -> None:
     with pytest.raises(wy.InputError, match="threads = 2 with several cloths"):
         wy.Simulator(wy.Scene([paper(4, 4), lifted(paper(4, 4), 1e-2)]), threads=2)
-    with pytest.raises(wy.InputError, match=r"cloths\[1\].spacing"):
-        wy.Cloths([paper(4, 4), paper(4, 4).replace(spacing=2e-3)])
+    with pytest.raises(wy.InputError, match=r"cloths\[1\].parallel_stiffness"):
+        wy.Cloths([paper(4, 4), paper(4, 4).replace(parallel_stiffness=2.0)])
     for wrong in ([], [1], "cloth"):
         with pytest.raises(wy.InputError, match="cloth"):
             wy.Scene(wrong)

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import inspect
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -53,10 +54,11 @@ def test_a_name_of_the_glossary_is_in_the_code(row):
 
 def test_every_number_of_a_cloth_is_in_the_glossary():
     listed = {row[-1].strip("`") for row in rows()}
-    numbers = {"Yarn": {"density", "stretch", "bend"}, "Wind": {f.name for f in dataclasses.fields(wy.Wind)}}
+    numbers = {"Yarn": {f.name for f in dataclasses.fields(wy.Yarn)} - {"color"}}
+    numbers |= {"Wind": {f.name for f in dataclasses.fields(wy.Wind)}}
     floats = inspect.signature(wy.Cloth).parameters.values()
-    numbers["Cloth"] = {p.name for p in floats if p.annotation in ("float", "float | None")}
-    assert len(numbers["Cloth"]) == 8
+    numbers["Cloth"] = {p.name for p in floats if p.annotation in ("float", "Each", "Each | None")}
+    assert len(numbers["Cloth"]) == 9
     missing = {f"{cls}.{name}" for cls, names in numbers.items() for name in names} - listed
     assert not missing
 
@@ -71,6 +73,24 @@ def test_links_lead_somewhere(page):
         assert path.exists(), target
         if anchor:
             assert anchor in anchors(path.read_text()), target
+
+
+def test_the_page_on_drafts_does_what_it_says(tmp_path, monkeypatch):
+    """Its code, one block after the other, on fewer yarns."""
+    blocks = re.findall(r"^```python\n(.+?)^```", (ROOT / "docs" / "drafts.md").read_text(), flags=re.M | re.S)
+    assert len(blocks) == 2
+    (tmp_path / "docs").mkdir()
+    shutil.copy(ROOT / "docs" / "houndstooth.wif", tmp_path / "docs")
+    monkeypatch.chdir(tmp_path)
+    space: dict = {}
+    for block in blocks:
+        exec(block.replace("26", "6").replace("run(150)", "run(2)"), space)
+    assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {
+        "draft.png",
+        "houndstooth.usdc",
+        "herringbone.wif",
+    }
+    assert len(space["cloth"].yarns) == 2 and len(space["trajectory"]) == 3
 
 
 def test_ci_runs_the_test_command_of_the_readme():

@@ -37,16 +37,20 @@ FORBIDDEN = {
     f"{W}.io": {f"{W}.simulation.simulator", f"{W}.device.model", f"{W}.integrators", f"{W}.gradients"},
     f"{W}.view": {f"{W}.simulation.simulator", f"{W}.device.model", f"{W}.integrators", f"{W}.gradients"},
     f"{W}.presets": {f"{W}.simulation", f"{W}.device", f"{W}.gradients", f"{W}.io"},
+    f"{W}.envs": {K, f"{W}.device", f"{W}.integrators", f"{W}.calibration", f"{W}.io", f"{W}.view"},
 }  # fmt: skip
 """What no module of a room imports."""
-TERMS_BY_NAME = {f"{W}.description.scene"}
+TERMS_BY_NAME = {f"{W}.description.scene", f"{W}.description.selection"}
 """A scene looks up which terms there are; no other description knows kernels."""
 
 ONLY = {
     "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "parts", "rollout", "run")}
-    | {f"{W}.calibration.problem"},
+    | {f"{W}.calibration.problem", f"{W}.envs.gradient", f"{W}.envs.throw", f"{W}.envs.throws"},
+    "gymnasium": {f"{W}.envs", f"{W}.envs.throw"},
+    "stable_baselines3": set(),
     "pxr": {f"{W}.io.usd", f"{W}.io.usd_prims"},
     "h5py": {f"{W}.io.published"},
+    "dtx_to_wif": {f"{W}.io.draft"},
     "viser": set(),
     "scenes": set(),
     "benchmarks": set(),
@@ -56,7 +60,8 @@ ONLY = {
 """Where a package may be imported at all; view/ asks for viser by name."""
 
 BETWEEN_TERMS = {(f"{K}.terms.jamming", f"{K}.terms.stretch")}
-"""The barrier between crossings takes k_s of the yarn from there."""
+BETWEEN_TERMS |= {(f"{K}.terms.crimp_interchange", f"{K}.terms.{name}") for name in ("stretch", "bending")}
+"""The barrier between crossings takes k_s of the yarn from there, and crimp interchange k_b too."""
 
 
 def modules() -> dict[str, Path]:
@@ -150,7 +155,9 @@ def test_importing_the_package_loads_no_extra():
     loaded = set(done.stdout.split())
     assert {"warp", "warp_yarn", "numpy"} <= loaded
     extras = {"pxr", "torch", "viser", "imageio", "h5py", "scipy", "matplotlib", "newton"}
+    extras |= {"gymnasium", "stable_baselines3"}
     assert not loaded & extras
+    assert "dtx_to_wif" not in loaded
 
 
 # -- the tests --------------------------------------------------------------------------------------------------------

@@ -63,6 +63,46 @@ def test_the_fabric_is_the_one_asked_for(fabric, usd, tmp_path):
     assert hang.main(["--resume", record, "--steps", "1", "--output", str(usd)]).cloth.yarns == expected.yarns
 
 
+DRAFT = ROOT / "docs" / "houndstooth.wif"
+
+
+@pytest.mark.parametrize("fabric", ["paper", "handkerchief"])
+def test_a_draft_is_woven_in_its_colours(fabric, usd):
+    """To USD, too, where colours are linear: 27 of 255 is 0.0109, by the curve of sRGB."""
+    arguments = ["--draft", str(DRAFT), "--fabric", fabric, "--rows", "7", "--columns", "6", "--steps", "1"]
+    cloth = hang.main([*arguments, "--output", str(usd)]).cloth
+    draft = wy.read_draft(DRAFT).tiled(rows=7, columns=6)
+    np.testing.assert_array_equal(cloth.weave.flipped, draft.weave.flipped)
+    np.testing.assert_array_equal([cloth.yarns[k].color for k in cloth.warp[::-1]], draft.warp_colors)
+    np.testing.assert_array_equal([cloth.yarns[k].color for k in cloth.weft], draft.weft_colors)
+    stage = Usd.Stage.Open(str(usd))
+    shapes = [UsdGeom.BasisCurves(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves)]
+    reds = sorted({round(float(shape.GetDisplayColorAttr().Get()[0][0]), 4) for shape in shapes})
+    assert reds == pytest.approx([0.0109, 0.8714], abs=1e-4)
+    expected = [dataclasses.replace(yarn, color=None) for yarn in wy.fabrics.FABRICS[fabric]().yarns]
+    assert {dataclasses.replace(yarn, color=None) for yarn in cloth.yarns} == set(expected)
+
+
+def test_weaves_in_words(usd):
+    cloth = hang.main(["--weave", "satin 5/2", "--size", "7", "--steps", "1", "--output", str(usd)]).cloth
+    np.testing.assert_array_equal(cloth.weave.flipped, wy.Weave.from_notation("satin 5/2", rows=7, columns=7).flipped)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--weave", "satin 6/2"], "there is no satin of 6 ends"),
+        (["--draft", "draft.txt"], "must end in .wif, .dtx, .wpo"),
+        (["--draft", "missing.wif"], "missing.wif: there is no such file"),
+        (["--draft", str(DRAFT), "--weave", "plain"], "--weave = plain does not go with --draft"),
+        (["--draft", str(DRAFT), "--rows", "2"], "rows = 2"),
+    ],
+)
+def test_drafts_and_weaves_that_cannot_be(arguments, told, usd, capsys):
+    assert exit_code(hang, [*arguments, "--output", str(usd)]) == 2
+    assert told in capsys.readouterr().err
+
+
 def test_locked_yarns_do_not_slide(usd):
     trajectory = hang.main(["--size", "5", "--steps", "5", "--output", str(usd), "--locked"])
     np.testing.assert_array_equal(trajectory.euler, np.broadcast_to(trajectory.cloth.euler, trajectory.euler.shape))
@@ -167,7 +207,7 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
     record = str(tmp_path / "first.npz")
     hang.main(["--size", "5", "--steps", "1", "--output", str(usd), "--record", record])
     others = (["--fabric", "paper"], ["--wind", "0", "5", "0"], ["--wind", "1", "0", "0"], ["--locked"])
-    for option in (["--rows", "5"], ["--weave", "plain"], ["--step", "1e-3"], *others):
+    for option in (["--rows", "5"], ["--weave", "plain"], ["--draft", str(DRAFT)], ["--step", "1e-3"], *others):
         assert exit_code(hang, ["--resume", record, *option]) == 2
         assert option[0] in capsys.readouterr().err
 

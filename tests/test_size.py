@@ -20,17 +20,17 @@ VERBS = set(
     re.findall(
         r"\w+",
         """
-        accept accumulate add adjoin adjust advance allocate allow answer apply approximate ask assemble assert
+        accept accumulate add adjoin adjust advance allocate allow answer append apply approximate ask assemble assert
         average begin bring build calibrate call capture carry catch change check choose clamp clear clip close
         coarsen collect combine come compare complete compute confirm constrain continue convert copy correct count
         cut damp decide declare decorate define delete describe differentiate distribute divide do drag draw drop
         end enter erase estimate evaluate exchange expand extend extrapolate factorize fail fetch fill find finish
-        fit flatten follow forget free freeze gather get give go guess halve hand hold identify ignore import
+        fit flatten follow forget free freeze gather get give go group guess halve hand hold identify ignore import
         initialize insert install integrate interpolate invert iterate join judge keep know launch learn leave let
         limit linearize list load look lower lump make match measure merge minimize mirror mix move multiply name
         normalize note number open pack parse pass pay perform pick place plot prepare prescribe press print probe
         produce project propagate prove pull push put raise reach read ready rebuild recall receive record recover
-        reduce refine refuse register release remember remove rename reorder replace replay report request reset
+        reduce refine refuse register release remember remove rename reorder repeat replace replay report request reset
         resolve restore restrict retreat return reverse rewrite rise roll rotate round run sample save say scale
         scan scatter search seed select send separate set settle shape shorten show shrink shuffle simulate skip
         slide smooth solve sort split spread square start stop store stretch subtract sum swap sweep switch

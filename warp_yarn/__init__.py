@@ -5,14 +5,18 @@ import importlib.metadata
 from types import ModuleType
 
 from . import moved, view
-from .description.cloth import Cloth, Yarn
+from .description.cloth import Cloth
 from .description.cloths import Cloths
+from .description.crimp import crimp_height
+from .description.draft import Draft
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
+from .description.yarn import Yarn
 from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
+from .io.draft import read_draft, write_draft
 from .io.published import Published, read_published
 from .io.usd import write_usd
 from .kernels import Term, TermParameter, Variant
@@ -21,6 +25,7 @@ from .registration import register_integrator, register_term, unregister_integra
 from .simulation.simulator import Simulator
 from .simulation.state import State, Trajectory
 from .view.camera import Camera
+from .view.drawdown import write_drawdown
 from .view.render import steady_camera, write_mp4, write_png
 
 moved.install()
@@ -36,6 +41,7 @@ __all__ = [
     "Cloths",
     "Contact",
     "Cylinder",
+    "Draft",
     "GradientError",
     "InputError",
     "Plane",
@@ -56,8 +62,10 @@ __all__ = [
     "Wind",
     "Yarn",
     "__version__",
+    "crimp_height",
     "fabrics",
     "paper",
+    "read_draft",
     "read_published",
     "register_integrator",
     "register_term",
@@ -66,6 +74,8 @@ __all__ = [
     "unregister_integrator",
     "unregister_term",
     "view",
+    "write_draft",
+    "write_drawdown",
     "write_mp4",
     "write_png",
     "write_usd",

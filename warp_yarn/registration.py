@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from .description.scene import checked_parameter
+from .description.selection import checked_parameter
 from .device.declarations import ASSEMBLY, FIELDS, INPUTS, PARAMETERS, STATE, TOPOLOGY
 from .device.declared import arguments
 from .device.exclusive import ALONE

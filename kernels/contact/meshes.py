@@ -223,7 +223,11 @@ TERM = Term(
     elements="nodes",
     define=define,
     energy=define_energy,
-    absent=lambda scene: "" if any(obstacle.shape == "mesh" for obstacle in scene.obstacles) else "there is no mesh",
+    absent=lambda scene: (
+        ""
+        if scene.has_barrier and any(obstacle.shape == "mesh" for obstacle in scene.obstacles)
+        else "there is no mesh with a barrier"
+    ),
     touches=True,
     kept=True,
 )

@@ -199,7 +199,7 @@ TERM = Term(
         TermParameter("contact_slip_speed", "m/s", above=0.0),
         TermParameter("contact_damping_speed", "m/s", above=0.0),
     ),
-    absent=lambda scene: "" if scene.obstacles else "there is no obstacle",
+    absent=lambda scene: "" if scene.obstacles and scene.has_barrier else "there is no obstacle with a barrier",
     touches=True,
     kept=True,
 )

@@ -273,6 +273,6 @@ TERM = Term(
         TermParameter("self_contact_damping_speed", "m/s", above=0.0),
         TermParameter("contact_friction", "", least=0.0),
     ),
-    absent=lambda scene: "" if scene.self_contact else "self_contact is False",
+    absent=lambda scene: "" if scene.self_contact and scene.has_barrier else "there is no self_contact by a barrier",
     touches=True,
 )

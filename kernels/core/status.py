@@ -3,7 +3,7 @@
 import warp as wp
 
 NOT_FINITE, ORDER_LOST, NOT_CONVERGED, STALLED, INACCURATE, GAINED = 1, 2, 3, 4, 5, 6
-OVERLAPPING, CROWDED, IMPACT = 7, 8, 9
+OVERLAPPING, CROWDED, IMPACT, UNRESOLVED = 7, 8, 9, 10
 """The first number of ``status``; ``status[1]`` is the node or -1, ``status[2]`` the step of its chunk."""
 
 

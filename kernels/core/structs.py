@@ -36,6 +36,17 @@ def structs(variant: Variant) -> SimpleNamespace:
         upper_ss: wp.array(dtype=scalar)
 
     @wp.struct
+    class Crimp:
+        """What crimp interchange runs over (``description/crimp.py``): of each node its four segments, what is at
+        their ends and the matrix blocks between those of two yarns, its two yarns; of each yarn 1/cos θ₀."""
+
+        crimp_sides: wp.array(dtype=wp.vec4i)
+        crimp_around: wp.array(dtype=wp.vec4i)
+        crimp_corners: wp.array(dtype=wp.vec4i)
+        node_yarns: wp.array(dtype=int)
+        lengthening: wp.array(dtype=scalar)
+
+    @wp.struct
     class SolverWork:
         """Vectors that a conjugate gradient works with, and a place for the sums of its threads."""
 
@@ -165,6 +176,7 @@ def structs(variant: Variant) -> SimpleNamespace:
         Obstacles=Obstacles,
         Faces=Faces,
         BlockMatrix=BlockMatrix,
+        Crimp=Crimp,
         SolverWork=SolverWork,
         SolveReport=SolveReport,
         NewtonControl=NewtonControl,

@@ -24,11 +24,19 @@ class Variant:
     reverse: bool = False
     term: str = ""
     """The term from outside the package whose kernels these are: they have modules of their own."""
+    general: bool = False
+    """Whether a cloth's numbers are of every segment, yarn, node or corner (``core/general.py``): only kernels that
+    read these are compiled for it."""
 
     @property
     def forward(self) -> "Variant":
         """Give the variant without reverse mode, of kernels that never need it."""
         return dataclasses.replace(self, reverse=False)
+
+    @property
+    def plain(self) -> "Variant":
+        """Give the variant of cloths whose numbers are single ones, of kernels that do not read them."""
+        return dataclasses.replace(self, general=False)
 
     @property
     def vec3(self) -> type:
@@ -58,7 +66,7 @@ class Variant:
         """
         parts = ["warp_yarn", name, *([self.term] if self.term else [])]
         parts += [self.scalar.__name__, "sliding" if self.sliding else "locked"]
-        return "_".join(parts + ["reverse"] * self.reverse)
+        return "_".join(parts + ["general"] * self.general + ["reverse"] * self.reverse)
 
     def fuse(self, module: str) -> None:
         """Lets the CPU's compiler contract a b + c in one of this variant's modules, which Warp's own fuse_fp does not:
@@ -91,7 +99,8 @@ class TermParameter:
     """What every value must be above."""
     of: str = "scene"
     """"scene": one number, ``name[0]`` in kernels, of the cloth as a whole too; "yarn": one of each material, and in
-    kernels of each yarn, ``name[segment_yarn[e]]``."""
+    kernels of each yarn, ``name[segment_yarn[e]]``; "crossing": one number, or in a general cloth one of each node,
+    ``name[own(node)]``."""
     size: int = 1
     """3: a vector, of any values."""
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import ends, index
 from ..core.memory import functions as access
 from ..core.status import NOT_FINITE, STALLED
@@ -228,7 +229,20 @@ def define(variant: Variant) -> SimpleNamespace:
                 status[0] = wp.static(STALLED)
                 status[1] = -1
 
-    @wp.kernel(module=module, enable_backward=False)
+    return SimpleNamespace(
+        start_rigid=start_rigid,
+        check_convergence=check_convergence,
+        control_newton=control_newton,
+    )
+
+
+@functools.cache
+def define_turning(variant: Variant) -> SimpleNamespace:
+    """Define what looks at how far yarns turn."""
+    scalar, vec3 = variant.scalar, variant.vec3
+    own = general.functions(variant).own
+
+    @wp.kernel(module=variant.module("stage"), enable_backward=False)
     def ask_for_matrix(
         segments: wp.array(dtype=wp.vec4i),
         step_size: wp.array(dtype=scalar),
@@ -237,14 +251,9 @@ def define(variant: Variant) -> SimpleNamespace:
         rebuild_matrix: wp.array(dtype=int),
     ):
         """Asks for a new matrix where a yarn turns in the step."""
-        a, b, _sa, _sb, _yarn, _direction = ends(segments, index(wp.tid()))
+        a, b, _sa, _sb, _yarn, direction = ends(segments, index(wp.tid()))
         moved = wp.length(solution[b] - solution[a]) * step_size[0]
-        if moved > scalar(wp.static(REBUILDING_TURN)) * spacing[0]:
+        if moved > scalar(wp.static(REBUILDING_TURN)) * spacing[own(2 * a + direction)]:
             rebuild_matrix[0] = 1
 
-    return SimpleNamespace(
-        start_rigid=start_rigid,
-        check_convergence=check_convergence,
-        control_newton=control_newton,
-        ask_for_matrix=ask_for_matrix,
-    )
+    return SimpleNamespace(ask_for_matrix=ask_for_matrix)

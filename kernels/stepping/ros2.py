@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.status import NOT_FINITE, fail
 from ..core.structs import structs
 from ..core.variant import Variant
@@ -23,6 +24,7 @@ GAMMA = 1.0 - 0.5**0.5
 def define_reversible(variant: Variant) -> SimpleNamespace:
     """Define what the adjoint runs in reverse."""
     scalar, vec3 = variant.scalar, variant.vec3
+    own = general.functions(variant).own
 
     @variant.kernel("ros2")
     def second_stage_damping(
@@ -38,7 +40,7 @@ def define_reversible(variant: Variant) -> SimpleNamespace:
         for direction in range(2):
             s = 2 * i + direction
             rate = euler_velocity[s] - scalar(2.0) * euler_first_solution[s]
-            wp.atomic_add(euler_rhs, s, coefficients[0][1] * friction_damping[0] * rate)
+            wp.atomic_add(euler_rhs, s, coefficients[0][1] * friction_damping[own(i)] * rate)
 
     return SimpleNamespace(second_stage_damping=second_stage_damping)
 

@@ -6,6 +6,7 @@
 and between this and the k_b π²/Δs of a flat fold where a segment has shrunk to nearly a point (``mollifier.py``).
 
 Parameters: ``bend`` B, bending modulus of each yarn [Pa m²] (the paper prints N/m); ``radius`` R and ``spacing`` L [m].
+In a general cloth R² is half the width times half the thickness of the yarn, and L that of each segment.
 
 θ² and θ/sin θ are taken from sin²θ by their series near 0: the state of rest is straight, and an acos near ±1 or a
 division by sin θ gives noise there, and NaN adjoints.
@@ -22,6 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import index
 from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
@@ -37,6 +39,7 @@ SERIES_BELOW = 1.0e-3
 def functions(variant: Variant) -> SimpleNamespace:
     """Make the Warp functions of one bend, shared with the contact force."""
     scalar, vec3 = variant.scalar, variant.vec3
+    presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
     vec2 = wp.types.vector(2, scalar)
 
     @wp.func
@@ -86,35 +89,36 @@ def functions(variant: Variant) -> SimpleNamespace:
         return force
 
     @wp.func
-    def bend_stiffness(modulus: scalar, radius: scalar) -> scalar:
+    def bend_stiffness(modulus: scalar, half_width: scalar, half_thickness: scalar) -> scalar:
         """Compute k_b = B π R² [N m²]."""
-        return modulus * scalar(wp.static(wp.PI)) * radius * radius
-
-    return SimpleNamespace(angle=bend_angle, force=bend_force, stiffness=bend_stiffness)
-
-
-def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
-    BlockMatrix = structs(variant).BlockMatrix
-    f = functions(variant)
-    bend_angle, bend_force, bend_stiffness = f.angle, f.force, f.stiffness
-    presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
+        return modulus * scalar(wp.static(wp.PI)) * half_width * half_thickness
 
     @wp.func
-    def bend_forces(e1: vec3, e2: vec3, k: scalar, unit: scalar):
+    def bend_forces(e1: vec3, e2: vec3, k: scalar, unit1: scalar, unit2: scalar):
         """Compute the forces on the ends that e1 and e2 lead to."""
         l1 = wp.length(e1)
         l2 = wp.length(e2)
-        s1 = presence(l1, unit)
-        s2 = presence(l2, unit)
-        by_l1 = inverse_length(l1, unit)
-        by_l2 = inverse_length(l2, unit)
+        s1 = presence(l1, unit1)
+        s2 = presence(l2, unit2)
+        by_l1 = inverse_length(l1, unit1)
+        by_l2 = inverse_length(l2, unit2)
         t1 = e1 * by_l1
         t2 = e2 * by_l2
         angle = bend_angle(t1, t2)
         f1 = bend_force(t1, t2, by_l1, s1, s2, k, angle[0], angle[1])
         f2 = bend_force(t2, t1, by_l2, s2, s1, k, angle[0], angle[1])
         return f1, f2
+
+    return SimpleNamespace(angle=bend_angle, force=bend_force, forces=bend_forces, stiffness=bend_stiffness)
+
+
+def define(variant: Variant) -> wp.Kernel:
+    scalar, vec3, sliding, of_each = variant.scalar, variant.vec3, variant.sliding, variant.general
+    BlockMatrix = structs(variant).BlockMatrix
+    f = functions(variant)
+    bend_angle, bend_force, bend_forces, bend_stiffness = f.angle, f.force, f.forces, f.stiffness
+    presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
+    own = general.functions(variant).own
 
     @wp.func
     def in_plane_excess(z: scalar, cosine: scalar, square: scalar, kappa: scalar, angle_over_sine: scalar) -> scalar:
@@ -159,25 +163,32 @@ def define(variant: Variant) -> wp.Kernel:
         sa = 2 * a + direction
         sb = 2 * b + direction
         rest = euler[sb] - euler[sa]
-        k = scalar(2.0) * bend_stiffness(bend[yarn], radius[0]) / rest
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        unit1 = spacing[own(2 * c + direction)]
+        unit2 = unit1
+        if wp.static(of_each):
+            half_thickness = radius[2 * yarn + 1]
+            unit2 = spacing[sa]
+        k = scalar(2.0) * bend_stiffness(bend[yarn], half_width, half_thickness) / rest
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
         if add_contact_load != 0:
             # from the crimped positions, x − R n on a warp yarn and x + R n on a weft yarn
             half = scalar(0.5) - scalar(direction)
-            crimp = scalar(-2.0) * half * radius[0]
+            crimp = scalar(-2.0) * half * half_thickness
             pressing_b, pressing_a = bend_forces(
-                e1 + (normal[b] - normal[c]) * crimp, e2 + (normal[a] - normal[c]) * crimp, k * half, spacing[0]
+                e1 + (normal[b] - normal[c]) * crimp, e2 + (normal[a] - normal[c]) * crimp, k * half, unit1, unit2
             )
             wp.atomic_add(contact_load, a, wp.dot(normal[a], pressing_a))
             wp.atomic_add(contact_load, b, wp.dot(normal[b], pressing_b))
             wp.atomic_add(contact_load, c, -wp.dot(normal[c], pressing_a + pressing_b))
         l1 = wp.length(e1)
         l2 = wp.length(e2)
-        s1 = presence(l1, spacing[0])
-        s2 = presence(l2, spacing[0])
-        by_l1 = inverse_length(l1, spacing[0])
-        by_l2 = inverse_length(l2, spacing[0])
+        s1 = presence(l1, unit1)
+        s2 = presence(l2, unit2)
+        by_l1 = inverse_length(l1, unit1)
+        by_l2 = inverse_length(l2, unit2)
         # by division: a straight yarn's are exact opposites
         t1 = wp.normalize(e1)
         t2 = wp.normalize(e2)
@@ -245,9 +256,10 @@ def define(variant: Variant) -> wp.Kernel:
 
 
 def define_energy(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar, vec3, of_each = variant.scalar, variant.vec3, variant.general
     bend_angle, bend_stiffness = functions(variant).angle, functions(variant).stiffness
     presence = mollifier.functions(variant).presence
+    own = general.functions(variant).own
 
     @variant.kernel("energy")
     def bending_energy(
@@ -265,14 +277,22 @@ def define_energy(variant: Variant) -> wp.Kernel:
         a = bend_nodes[e][0]
         c = bend_nodes[e][1]
         b = bend_nodes[e][2]
-        direction = yarn_direction[bend_yarn[e]]
+        yarn = bend_yarn[e]
+        direction = yarn_direction[yarn]
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        unit1 = spacing[own(2 * c + direction)]
+        unit2 = unit1
+        if wp.static(of_each):
+            half_thickness = radius[2 * yarn + 1]
+            unit2 = spacing[2 * a + direction]
         rest = euler[2 * b + direction] - euler[2 * a + direction]
         e1 = position[b] - position[c]
         e2 = position[a] - position[c]
-        fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
+        fading = presence(wp.length(e1), unit1)[0] * presence(wp.length(e2), unit2)[0]
         square = bend_angle(wp.normalize(e1), wp.normalize(e2))[0]
         faded = square * fading + scalar(wp.static(FLAT)) * (scalar(1.0) - fading)
-        wp.atomic_add(energy, 0, bend_stiffness(bend[bend_yarn[e]], radius[0]) * faded / rest)
+        wp.atomic_add(energy, 0, bend_stiffness(bend[yarn], half_width, half_thickness) * faded / rest)
 
     return bending_energy
 

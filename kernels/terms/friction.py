@@ -13,7 +13,8 @@ that a step moves by many times μF_n/k_f would else be held by more than μF_n,
 ``published_scaling`` takes eq. 4 as published, arguments in SI units.
 
 Parameters: ``friction`` μ; ``friction_stiffness`` k_f [N/m]; ``friction_damping`` d_f [N s/m];
-``friction_sharpness`` p.
+``friction_sharpness`` p. In a general cloth all but p are of every crossing, and the floor's spacing is that to the
+next crossing of the warp yarn.
 
 The matrix holds −∂F/∂δ (never negative) and d_f. What F depends on through F_n and F_s is not symmetric, and left out.
 """
@@ -23,6 +24,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import index
 from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
@@ -95,6 +97,7 @@ def define(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
     BlockMatrix = structs(variant).BlockMatrix
     friction_force = functions(variant).force
+    own = general.functions(variant).own
 
     @variant.kernel("terms")
     def friction_term(
@@ -122,27 +125,27 @@ def define(variant: Variant) -> wp.Kernel:
     ):
         e = index(wp.tid())
         i = index(crossing_node[e])
-        limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
-        floor = friction_stiffness[0] * spacing[0] * scalar(wp.static(FLOOR))
+        limit = friction[own(i)] * wp.max(contact_load[i], scalar(0.0))
+        floor = friction_stiffness[own(i)] * spacing[own(2 * i)] * scalar(wp.static(FLOOR))
         for direction in range(2):
             s = 2 * i + direction
             f = friction_force(
                 euler[s] - anchor[s],
                 euler_force[s],
                 limit,
-                friction_stiffness[0],
+                friction_stiffness[own(i)],
                 friction_sharpness[0],
                 floor,
                 published_scaling,
             )
-            friction_force_out[s] = f[0] - friction_damping[0] * euler_velocity[s]
+            friction_force_out[s] = f[0] - friction_damping[own(i)] * euler_velocity[s]
             if matrix != 0:
-                damping = blocks.coefficients[0][1] * friction_damping[0]
+                damping = blocks.coefficients[0][1] * friction_damping[own(i)]
                 wp.atomic_add(euler_momentum, s, damping * euler_velocity[s])
                 slope = f[1]
                 if blocks.evaluations[0] > wp.static(CYCLING) and blocks.evaluations[0] % 2 == 0:
                     delta = wp.abs(euler[s] - anchor[s])
-                    slope = wp.max(slope, wp.abs(f[0]) / wp.max(delta, floor / friction_stiffness[0]))
+                    slope = wp.max(slope, wp.abs(f[0]) / wp.max(delta, floor / friction_stiffness[own(i)]))
                 wp.atomic_add(blocks.diagonal_ss, s, damping + blocks.coefficients[0][2] * slope)
 
     return friction_term
@@ -150,6 +153,7 @@ def define(variant: Variant) -> wp.Kernel:
 
 def define_anchor(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
+    own = general.functions(variant).own
 
     @variant.kernel("terms")
     def update_anchor(
@@ -164,7 +168,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
         """Move s̄ to where it is after the step: held while k_f |δ| ≤ μF_n, dragged along beyond."""
         e = index(wp.tid())
         i = index(crossing_node[e])
-        reach = friction[0] * wp.max(contact_load[i], scalar(0.0)) / friction_stiffness[0]
+        reach = friction[own(i)] * wp.max(contact_load[i], scalar(0.0)) / friction_stiffness[own(i)]
         for direction in range(2):
             s = 2 * i + direction
             delta = euler_next[s] - anchor[s]
@@ -175,6 +179,7 @@ def define_anchor(variant: Variant) -> wp.Kernel:
 
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
+    own = general.functions(variant).own
 
     @variant.kernel("energy")
     def friction_energy(
@@ -189,11 +194,11 @@ def define_energy(variant: Variant) -> wp.Kernel:
         """Add up what friction's springs can give back: the work of their force, at most μF_n, on the way to the
         anchor."""
         i = crossing_node[wp.tid()]
-        limit = friction[0] * wp.max(contact_load[i], scalar(0.0))
+        limit = friction[own(i)] * wp.max(contact_load[i], scalar(0.0))
         for direction in range(2):
             delta = wp.abs(euler[2 * i + direction] - anchor[2 * i + direction])
-            spring = wp.min(delta, limit / friction_stiffness[0])
-            stored = scalar(0.5) * friction_stiffness[0] * spring * spring + limit * (delta - spring)
+            spring = wp.min(delta, limit / friction_stiffness[own(i)])
+            stored = scalar(0.5) * friction_stiffness[own(i)] * spring * spring + limit * (delta - spring)
             wp.atomic_add(energy, 0, stored)
 
     return friction_energy
@@ -205,9 +210,9 @@ TERM = Term(
     define=define,
     energy=define_energy,
     parameters=(
-        TermParameter("friction", "", least=0.0),
-        TermParameter("friction_stiffness", "N/m", above=0.0),
-        TermParameter("friction_damping", "N s/m", least=0.0),
+        TermParameter("friction", "", least=0.0, of="crossing"),
+        TermParameter("friction_stiffness", "N/m", above=0.0, of="crossing"),
+        TermParameter("friction_damping", "N s/m", least=0.0, of="crossing"),
         TermParameter("friction_sharpness", "", above=0.0),
     ),
     needs_contact=True,

@@ -10,6 +10,10 @@ barrier of Li et al. (Incremental Potential Contact, 2020),
 convex, 0 with its first and second derivative from d̂ on, and without bound as Δs → 0. A segment that has collapsed to
 a point loses ½ kₛ of energy for every metre of yarn that leaves it: the barrier holds that at 0.65 d̂.
 
+In a general cloth L is the distance of the two crossings at rest, and d half the widths of the yarns that cross there,
+together, and the thickness of this one where they are flipped against each other, all times 1 + c of its crimp, which
+Δs is longer by; the R of d̂ is half the mean width of the two.
+
 Parameters: ``parallel_stiffness`` k_c [N/m]; ``stretch`` Y of each yarn [Pa], for kₛ = Y π R²; ``spacing`` L [m];
 ``radius`` R [m].
 
@@ -21,6 +25,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import ends, index
 from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
@@ -57,7 +62,9 @@ def functions(variant: Variant) -> SimpleNamespace:
 def define(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
     BlockMatrix = structs(variant).BlockMatrix
-    barrier = functions(variant).barrier
+    barrier, of_each = functions(variant).barrier, variant.general
+    f = general.functions(variant)
+    own, longer, half_width_at = f.own, f.longer, f.half_width
     stretch_stiffness = stretching.functions(variant).stiffness
 
     @variant.kernel("terms")
@@ -79,15 +86,25 @@ def define(variant: Variant) -> wp.Kernel:
         blocks: BlockMatrix,
     ):
         a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
-        distance = scalar(2.0) * radius[0]
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        # half the mean width of the yarns that cross there
+        across = half_width
+        if wp.static(of_each):
+            half_thickness = longer(radius, yarn) * radius[2 * yarn + 1]
+            across = half_width_at(spacing, a, 1 - direction) + half_width_at(spacing, b, 1 - direction)
+            across *= scalar(0.5) * longer(radius, yarn)
+        distance = scalar(2.0) * across
         if flipped[a] != flipped[b]:
-            distance = scalar(4.0) * radius[0]
+            distance = scalar(2.0) * (across + half_thickness)
         rest = euler[sb] - euler[sa]
         overlap = distance - rest
         if overlap > scalar(0.0):
-            k = parallel_stiffness[0] * spacing[0]
-            reach = radius[0] * scalar(wp.static(BARRIER))
-            guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], radius[0]))
+            k = parallel_stiffness[0] * spacing[own(sa)]
+            reach = across * scalar(wp.static(BARRIER))
+            if wp.static(of_each):
+                half_thickness = radius[2 * yarn + 1]
+            guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], half_width, half_thickness))
             f = k * overlap + guard[1]
             wp.atomic_add(euler_force, sa, -f)
             wp.atomic_add(euler_force, sb, f)
@@ -102,7 +119,17 @@ def define(variant: Variant) -> wp.Kernel:
 
 def define_energy(variant: Variant) -> wp.Kernel:
     scalar = variant.scalar
-    barrier = functions(variant).barrier
+    barrier, of_each = functions(variant).barrier, variant.general
+    own = general.functions(variant).own
+
+    @wp.func
+    def half_width_across(radius: wp.array(dtype=scalar), node_yarns: wp.array(dtype=int), node: int, direction: int):
+        """Look up half the width of the yarn that crosses one of this direction at a node, 0 where none does."""
+        yarn = node_yarns[2 * node + 1 - direction]
+        if yarn >= 0:
+            return radius[2 * yarn]
+        return scalar(0.0)
+
     stretch_stiffness = stretching.functions(variant).stiffness
 
     @variant.kernel("energy")
@@ -113,18 +140,31 @@ def define_energy(variant: Variant) -> wp.Kernel:
         stretch: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
         radius: wp.array(dtype=scalar),
+        node_yarns: wp.array(dtype=int),
+        lengthening: wp.array(dtype=scalar),
         euler: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
-        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
-        distance = scalar(2.0) * radius[0]
+        a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        # half the mean width of the yarns that cross there
+        across = half_width
+        if wp.static(of_each):
+            half_thickness = lengthening[yarn] * radius[2 * yarn + 1]
+            across = half_width_across(radius, node_yarns, a, direction)
+            across += half_width_across(radius, node_yarns, b, direction)
+            across *= scalar(0.5) * lengthening[yarn]
+        distance = scalar(2.0) * across
         if flipped[a] != flipped[b]:
-            distance = scalar(4.0) * radius[0]
+            distance = scalar(2.0) * (across + half_thickness)
         rest = euler[sb] - euler[sa]
         overlap = wp.max(distance - rest, scalar(0.0))
-        k = parallel_stiffness[0] * spacing[0]
-        reach = radius[0] * scalar(wp.static(BARRIER))
-        guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], radius[0]))
+        k = parallel_stiffness[0] * spacing[own(sa)]
+        reach = across * scalar(wp.static(BARRIER))
+        if wp.static(of_each):
+            half_thickness = radius[2 * yarn + 1]
+        guard = barrier(rest, reach, k + stretch_stiffness(stretch[yarn], half_width, half_thickness))
         wp.atomic_add(energy, 0, scalar(0.5) * k * overlap * overlap + guard[0])
 
     return parallel_energy

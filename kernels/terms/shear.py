@@ -13,6 +13,10 @@ of the crossing, V is between this and the energy at φ = 0 (``mollifier.py``).
 
 Parameters: ``shear`` S [Pa]; ``spacing`` L and ``radius`` R [m].
 
+In a general cloth S is of every crossing, R² half the width of the warp yarn times that of the weft yarn, L of a corner
+the mean of those to its two neighbours, and φ_l = arcsin(b_p/L_p) + arcsin(b_r/L_r), b half the mean width of the two
+parallel yarns at the crossing and at the neighbour; the L/R of γ is then 1/sin(φ_l/2), as where all are the same.
+
 The matrix is the Gauss-Newton part, (V'/(φ − φ̄)) ∇φ ∇φᵀ, exact at the right angle; V'' in place of its factor where the
 lock makes V'' larger, up to four times so; and of a shrinking segment the positive part of the curvature along it.
 """
@@ -22,6 +26,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import index
 from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
@@ -107,19 +112,27 @@ def functions(variant: Variant) -> SimpleNamespace:
         return shear_lock(strain, scalar(0.0), scalar(1.0), threshold, spacing_by_radius, 0)[0]
 
     @wp.func
-    def shear_unlocked(shear: scalar, radius: scalar, spacing: scalar, load: scalar) -> scalar:
-        """Compute k L of a corner that does not jam [N m]."""
+    def shear_unlocked(shear: scalar, warp: scalar, weft: scalar, spacing: scalar, load: scalar) -> scalar:
+        """Compute k L of a corner that does not jam [N m]; warp and weft: half the widths of the two yarns."""
         pressed = scalar(1.0) + wp.max(load, scalar(0.0))
-        return shear * scalar(wp.static(wp.PI)) * radius * radius * pressed * spacing
+        return shear * scalar(wp.static(wp.PI)) * warp * weft * pressed * spacing
 
-    return SimpleNamespace(lock=shear_lock, angle=shear_angle, shut=shear_shut, unlocked=shear_unlocked)
+    @wp.func
+    def shear_ratio(threshold: scalar) -> scalar:
+        """Compute L/R of a corner that locks at an angle, 1/sin(φ_l/2)."""
+        return scalar(1.0) / wp.sin(scalar(0.5) * threshold)
+
+    return SimpleNamespace(
+        lock=shear_lock, angle=shear_angle, shut=shear_shut, unlocked=shear_unlocked, ratio=shear_ratio
+    )
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar, vec3, of_each = variant.scalar, variant.vec3, variant.general
     BlockMatrix = structs(variant).BlockMatrix
     f = functions(variant)
     shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
+    shear_ratio, half_width = f.ratio, general.functions(variant).half_width
     presence, inverse_length = mollifier.functions(variant).presence, mollifier.functions(variant).inverse_length
 
     @wp.func
@@ -202,10 +215,36 @@ def define(variant: Variant) -> wp.Kernel:
         up = index(crossing_neighbours[e][2])
         down = index(crossing_neighbours[e][3])
         jams = corner_jams[e]
-        unit = spacing[0]
-        ratio = unit / radius[0]
-        angle = lock_angle[0]
-        k = shear_unlocked(shear[0], radius[0], unit, contact_load[c])
+        # L of the segments to the four neighbours; of the four corners φ_l, L/R, and k L unlocked
+        if wp.static(of_each):
+            u_l = spacing[2 * left]
+            u_r = spacing[2 * c]
+            u_u = spacing[2 * up + 1]
+            u_d = spacing[2 * c + 1]
+            angle_lu = lock_angle[4 * e]
+            angle_ld = lock_angle[4 * e + 1]
+            angle_ru = lock_angle[4 * e + 2]
+            angle_rd = lock_angle[4 * e + 3]
+            ratio_lu = shear_ratio(angle_lu)
+            ratio_ld = shear_ratio(angle_ld)
+            ratio_ru = shear_ratio(angle_ru)
+            ratio_rd = shear_ratio(angle_rd)
+            warp_width = half_width(spacing, c, 0)
+            weft_width = half_width(spacing, c, 1)
+            unlocked = shear_unlocked(shear[c], warp_width, weft_width, scalar(0.5), contact_load[c])
+            soft_lu = unlocked * (u_l + u_u)
+            soft_ld = unlocked * (u_l + u_d)
+            soft_ru = unlocked * (u_r + u_u)
+            soft_rd = unlocked * (u_r + u_d)
+        else:
+            unit = spacing[0]
+            u_l, u_r, u_u, u_d = unit, unit, unit, unit
+            angle = lock_angle[0]
+            angle_lu, angle_ld, angle_ru, angle_rd = angle, angle, angle, angle
+            ratio = unit / radius[0]
+            ratio_lu, ratio_ld, ratio_ru, ratio_rd = ratio, ratio, ratio, ratio
+            soft = shear_unlocked(shear[0], radius[0], radius[0], unit, contact_load[c])
+            soft_lu, soft_ld, soft_ru, soft_rd = soft, soft, soft, soft
         x = position[c]
         e_l = position[left] - x
         e_r = position[right] - x
@@ -215,32 +254,39 @@ def define(variant: Variant) -> wp.Kernel:
         l_r = wp.length(e_r)
         l_u = wp.length(e_u)
         l_d = wp.length(e_d)
-        b_l = inverse_length(l_l, unit)
-        b_r = inverse_length(l_r, unit)
-        b_u = inverse_length(l_u, unit)
-        b_d = inverse_length(l_d, unit)
+        b_l = inverse_length(l_l, u_l)
+        b_r = inverse_length(l_r, u_r)
+        b_u = inverse_length(l_u, u_u)
+        b_d = inverse_length(l_d, u_d)
         t_l = e_l * b_l
         t_r = e_r * b_r
         t_u = e_u * b_u
         t_d = e_d * b_d
-        s_l = presence(l_l, unit)
-        s_r = presence(l_r, unit)
-        s_u = presence(l_u, unit)
-        s_d = presence(l_d, unit)
-        shut = scalar(1.0)
+        s_l = presence(l_l, u_l)
+        s_r = presence(l_r, u_r)
+        s_u = presence(l_u, u_u)
+        s_d = presence(l_d, u_d)
+        shut_lu = scalar(1.0)
+        shut_ld, shut_ru, shut_rd = shut_lu, shut_lu, shut_lu
         if s_l[0] * s_r[0] * s_u[0] * s_d[0] < scalar(1.0):
-            shut = shear_shut(angle, ratio)
+            shut_lu = shear_shut(angle_lu, ratio_lu)
+            if wp.static(of_each):
+                shut_ld = shear_shut(angle_ld, ratio_ld)
+                shut_ru = shear_shut(angle_ru, ratio_ru)
+                shut_rd = shear_shut(angle_rd, ratio_rd)
+            else:
+                shut_ld, shut_ru, shut_rd = shut_lu, shut_lu, shut_lu
         f_lu, f_ul, g_lu, g_ul, k_lu, a_lu, a_ul = shear_corner(
-            t_l, t_u, b_l, b_u, s_l, s_u, k, jams[0], angle, ratio, shut, matrix
+            t_l, t_u, b_l, b_u, s_l, s_u, soft_lu, jams[0], angle_lu, ratio_lu, shut_lu, matrix
         )
         f_ld, f_dl, g_ld, g_dl, k_ld, a_ld, a_dl = shear_corner(
-            t_l, t_d, b_l, b_d, s_l, s_d, k, jams[1], angle, ratio, shut, matrix
+            t_l, t_d, b_l, b_d, s_l, s_d, soft_ld, jams[1], angle_ld, ratio_ld, shut_ld, matrix
         )
         f_ru, f_ur, g_ru, g_ur, k_ru, a_ru, a_ur = shear_corner(
-            t_r, t_u, b_r, b_u, s_r, s_u, k, jams[2], angle, ratio, shut, matrix
+            t_r, t_u, b_r, b_u, s_r, s_u, soft_ru, jams[2], angle_ru, ratio_ru, shut_ru, matrix
         )
         f_rd, f_dr, g_rd, g_dr, k_rd, a_rd, a_dr = shear_corner(
-            t_r, t_d, b_r, b_d, s_r, s_d, k, jams[3], angle, ratio, shut, matrix
+            t_r, t_d, b_r, b_d, s_r, s_d, soft_rd, jams[3], angle_rd, ratio_rd, shut_rd, matrix
         )
         f_l = f_lu + f_ld
         f_r = f_ru + f_rd
@@ -287,9 +333,10 @@ def define(variant: Variant) -> wp.Kernel:
 
 
 def define_energy(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar, vec3, of_each = variant.scalar, variant.vec3, variant.general
     f = functions(variant)
     shear_lock, shear_angle, shear_shut, shear_unlocked = f.lock, f.angle, f.shut, f.unlocked
+    shear_ratio, own = f.ratio, general.functions(variant).own
     presence = mollifier.functions(variant).presence
 
     @variant.kernel("energy")
@@ -301,24 +348,39 @@ def define_energy(variant: Variant) -> wp.Kernel:
         radius: wp.array(dtype=scalar),
         spacing: wp.array(dtype=scalar),
         lock_angle: wp.array(dtype=scalar),
+        node_yarns: wp.array(dtype=int),
         position: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=scalar),
         energy: wp.array(dtype=scalar),
     ):
         e = wp.tid()
         c = crossing_node[e]
-        k = shear_unlocked(shear[0], radius[0], spacing[0], contact_load[c])
-        ratio = spacing[0] / radius[0]
+        warp_width = radius[0]
+        weft_width = radius[0]
+        if wp.static(of_each):
+            warp_width = radius[2 * node_yarns[2 * c]]
+            weft_width = radius[2 * node_yarns[2 * c + 1]]
         for corner in range(4):
-            e1 = position[crossing_neighbours[e][corner / 2]] - position[c]
-            e2 = position[crossing_neighbours[e][2 + corner % 2]] - position[c]
-            fading = presence(wp.length(e1), spacing[0])[0] * presence(wp.length(e2), spacing[0])[0]
+            p = crossing_neighbours[e][corner / 2]
+            r = crossing_neighbours[e][2 + corner % 2]
+            # the lower node of a segment has its L
+            unit1 = spacing[own(2 * wp.min(p, c))]
+            unit2 = spacing[own(2 * wp.min(r, c) + 1)]
+            lock_at = lock_angle[own(4 * e + corner)]
+            ratio = unit1 / warp_width
+            if wp.static(of_each):
+                ratio = shear_ratio(lock_at)
+            unit = scalar(0.5) * (unit1 + unit2)
+            k = shear_unlocked(shear[own(c)], warp_width, weft_width, unit, contact_load[c])
+            e1 = position[p] - position[c]
+            e2 = position[r] - position[c]
+            fading = presence(wp.length(e1), unit1)[0] * presence(wp.length(e2), unit2)[0]
             angle = shear_angle(wp.normalize(e1), wp.normalize(e2))
             now = angle[0] * angle[0]
             largest = scalar(wp.static(0.25 * wp.PI * wp.PI))
             if corner_jams[e][corner] != 0:
-                now *= shear_lock(angle[0], angle[1], angle[2], lock_angle[0], ratio, 0)[0]
-                largest *= shear_shut(lock_angle[0], ratio)
+                now *= shear_lock(angle[0], angle[1], angle[2], lock_at, ratio, 0)[0]
+                largest *= shear_shut(lock_at, ratio)
             wp.atomic_add(energy, 0, scalar(0.5) * k * (now * fading + largest * (scalar(1.0) - fading)))
 
     return shear_energy
@@ -329,7 +391,7 @@ TERM = Term(
     elements="crossings",
     define=define,
     energy=define_energy,
-    parameters=(TermParameter("shear", "Pa", least=0.0),),
+    parameters=(TermParameter("shear", "Pa", least=0.0, of="crossing"),),
     stencil=6,
     needs_contact=True,
 )

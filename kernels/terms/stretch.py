@@ -4,6 +4,9 @@
 
 Parameters: ``stretch`` Y, stretch modulus of each yarn [Pa] (the paper prints N/m); ``radius`` R [m].
 
+In a general cloth R² is half the width times half the thickness of the yarn. A yarn of crimp c, 1 + c times as long as
+the distance that it covers, stretches as that distance does, its crimp held: w is (1 + c)(x_b − x_a)/Δs here.
+
 In (l, Δs), l = |x_b − x_a|, the energy is kₛ (l − Δs)²/(2Δs), jointly convex for Δs > 0. The matrix is its exact
 positive semi-definite part: (kₛ/Δs) g gᵀ with g = (−t, |w|; t, −|w|), and the transverse stiffness kₛ(|w|−1)/l,
 which is dropped where the yarn is slack.
@@ -14,6 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from ..core import general
 from ..core.indexing import ends, index
 from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
@@ -25,9 +29,9 @@ def functions(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
 
     @wp.func
-    def stretch_stiffness(modulus: scalar, radius: scalar) -> scalar:
+    def stretch_stiffness(modulus: scalar, half_width: scalar, half_thickness: scalar) -> scalar:
         """Compute kₛ = Y π R² [N]."""
-        return modulus * scalar(wp.static(wp.PI)) * radius * radius
+        return modulus * scalar(wp.static(wp.PI)) * half_width * half_thickness
 
     @wp.func
     def stretch_force(d: vec3, rest: scalar, stiffness: scalar) -> vec3:
@@ -38,9 +42,10 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 def define(variant: Variant) -> wp.Kernel:
-    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    scalar, vec3, sliding, of_each = variant.scalar, variant.vec3, variant.sliding, variant.general
     BlockMatrix = structs(variant).BlockMatrix
     stretch_stiffness, stretch_force = functions(variant).stiffness, functions(variant).force
+    own, longer = general.functions(variant).own, general.functions(variant).longer
 
     @variant.kernel("terms")
     def stretch_term(
@@ -65,9 +70,16 @@ def define(variant: Variant) -> wp.Kernel:
         a, b, sa, sb, yarn, direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
         d = position[b] - position[a]
-        k = stretch_stiffness(stretch[yarn], radius[0])
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        if wp.static(of_each):
+            half_thickness = radius[2 * yarn + 1]
+            d *= longer(radius, yarn)
+        k = stretch_stiffness(stretch[yarn], half_width, half_thickness)
 
         f = stretch_force(d, rest, k)
+        if wp.static(of_each):
+            f *= longer(radius, yarn)
         wp.atomic_add(force, a, f)
         wp.atomic_add(force, b, -f)
         if add_contact_load != 0:
@@ -86,11 +98,15 @@ def define(variant: Variant) -> wp.Kernel:
             along = blocks.coefficients[0][2] * k / rest
             across = along * wp.max(ratio - scalar(1.0), scalar(0.0)) / wp.max(ratio, scalar(1.0e-12))
             xx = wp.outer(t, t) * (along - across) + wp.identity(n=3, dtype=scalar) * across
+            if wp.static(of_each):
+                xx *= longer(radius, yarn) * longer(radius, yarn)
             wp.atomic_add(blocks.diagonal_xx, a, xx)
             wp.atomic_add(blocks.diagonal_xx, b, xx)
             wp.atomic_add(blocks.upper_xx, index(blocks.stencil * a + direction), -xx)
             if wp.static(sliding):
                 xs = t * (along * ratio)
+                if wp.static(of_each):
+                    xs *= longer(radius, yarn)
                 ss = along * ratio * ratio
                 wp.atomic_add(blocks.diagonal_xs, sa, -xs)
                 wp.atomic_add(blocks.diagonal_xs, sb, -xs)
@@ -104,8 +120,9 @@ def define(variant: Variant) -> wp.Kernel:
 
 
 def define_energy(variant: Variant) -> wp.Kernel:
-    scalar, vec3 = variant.scalar, variant.vec3
+    scalar, vec3, of_each = variant.scalar, variant.vec3, variant.general
     stretch_stiffness = functions(variant).stiffness
+    own, longer = general.functions(variant).own, general.functions(variant).longer
 
     @variant.kernel("energy")
     def stretch_energy(
@@ -118,8 +135,14 @@ def define_energy(variant: Variant) -> wp.Kernel:
     ):
         a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
         rest = euler[sb] - euler[sa]
-        strain = wp.length(position[b] - position[a]) / rest - scalar(1.0)
-        k = stretch_stiffness(stretch[yarn], radius[0])
+        length = wp.length(position[b] - position[a])
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        if wp.static(of_each):
+            half_thickness = radius[2 * yarn + 1]
+            length *= longer(radius, yarn)
+        strain = length / rest - scalar(1.0)
+        k = stretch_stiffness(stretch[yarn], half_width, half_thickness)
         wp.atomic_add(energy, 0, scalar(0.5) * k * rest * strain * strain)
 
     return stretch_energy
@@ -131,6 +154,7 @@ TERM = Term(
     define=define,
     energy=define_energy,
     parameters=(TermParameter("stretch", "Pa", least=0.0, of="yarn"),),
+    absent=lambda scene: "crimp_interchange takes its place" if scene.crimp_interchange else "",
     stencil=2,
     presses=True,
     energy_watched_as="elastic_energy",

@@ -54,25 +54,25 @@ class TestBending(InternalChecks):
         return elements.matrix(vmap(within_plane)(q, k) + vmap(across_plane)(q, k), len(case.q))
 
 
-def fading(q: Tensor, k: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+def fading(q: Tensor, k: Tensor, l1: Tensor, l2: Tensor) -> tuple[Tensor, Tensor]:
     """s(l₁) s(l₂), and what a matrix has of it: the second derivative of (1 − s) k π²/Δs in Δs, and the positive parts
     of that of V in each length with the angle held."""
     e1, e2 = q[6:9] - q[3:6], q[0:3] - q[3:6]
     rest = q[10] - q[9]
     gain = k * (bend(q) ** 2 - math.pi**2) / rest
-    part = presence(e1, spacing) * presence(e2, spacing)
+    part = presence(e1, l1) * presence(e2, l2)
     by_rest = tensor([0.0] * 9 + [-1.0, 1.0])
     total = 2.0 * (1.0 - part) * k * math.pi**2 / rest**3 * torch.outer(by_rest, by_rest)
-    for e, other, ends in ((e1, e2, (6, 3)), (e2, e1, (0, 3))):
+    for e, own, other, its, ends in ((e1, l1, e2, l2, (6, 3)), (e2, l2, e1, l1, (0, 3))):
 
-        def fade(stretched: Tensor, e: Tensor = e) -> Tensor:
-            return presence(unit(e) * stretched, spacing)
+        def fade(stretched: Tensor, e: Tensor = e, own: Tensor = own) -> Tensor:
+            return presence(unit(e) * stretched, own)
 
         second = (gain * hessian(fade)(torch.linalg.vector_norm(e))).clamp(min=0.0)
         g = torch.zeros(11, dtype=torch.float64)
         g = g.index_add(0, torch.arange(ends[0], ends[0] + 3), unit(e))
         g = g.index_add(0, torch.arange(ends[1], ends[1] + 3), -unit(e))
-        total = total + second * presence(other, spacing) * torch.outer(g, g)
+        total = total + second * presence(other, its) * torch.outer(g, g)
     return part, total
 
 
@@ -89,7 +89,7 @@ class TestCollapsedSegments(TestBending):
         """The same fades out, and the positive part of how it fades comes in."""
         elements = self.oracle(case).bending
         q, k = case.q[elements.unknowns], elements.parameters[0]
-        fade, along = vmap(functools.partial(fading, spacing=case.cloth.spacing))(q, k)
+        fade, along = vmap(fading)(q, *elements.parameters)
         blocks = vmap(within_plane)(q, k) + vmap(across_plane)(q, k)
         return elements.matrix(fade[:, None, None] * blocks + along, len(case.q))
 
@@ -161,9 +161,9 @@ def test_flat_fold_is_finite(name: str) -> None:
     """Folded onto itself a yarn has the energy of θ = π; the direction of its force is undefined, and finite."""
     case = Case(name, "flat", True)
     sim, o, n = case.simulator("bending"), case.oracle("bending"), case.cloth.nodes
-    q, k = case.q[o.bending.unknowns], o.bending.parameters[0]
+    q = case.q[o.bending.unknowns]
     assert float(vmap(bend)(q).max()) == np.pi
-    assert error(sim.energy(case.state)["bending"], vmap(o.bending.local)(q, k).sum()) < 1e-14
+    assert error(sim.energy(case.state)["bending"], o.bending.energy(case.q)) < 1e-14
     x, s = sim.forces(case.state)["bending"]
     assert np.isfinite(x).all()
     assert error(s.ravel(), o.force("bending", case.q, case.v, case.anchor)[3 * n :]) < 1e-14

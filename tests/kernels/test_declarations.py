@@ -1,5 +1,6 @@
 """Hold every argument of every kernel to the one place that declares it, and every array to what is declared."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -14,8 +15,9 @@ from warp_yarn.device.declared import Struct
 from warp_yarn.device.fields import Field
 
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
+VARIANTS += [dataclasses.replace(variant, general=True) for variant in VARIANTS[:4]]
 STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAdjoint", "Levels"}
-STRUCTS |= {"Pairs", "Obstacles", "Faces"}
+STRUCTS |= {"Pairs", "Obstacles", "Faces", "Crimp"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
 """Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""
@@ -66,20 +68,27 @@ def test_groups_share_no_name():
 
 
 @pytest.mark.parametrize(
-    ("options", "sliding"),
+    ("name", "options", "sliding"),
     [
-        ({"integrator": "sdirk2", "preconditioner": "multilevel", "step_error": 1e-2}, True),
-        ({"integrator": "ros2", "differentiable": True}, False),
-        ({"integrator": "implicit-midpoint", "precision": "single"}, True),
+        ("twill", {"integrator": "sdirk2", "preconditioner": "multilevel", "step_error": 1e-2}, True),
+        ("twill", {"integrator": "ros2", "differentiable": True}, False),
+        ("twill", {"integrator": "implicit-midpoint", "precision": "single"}, True),
+        ("general", {"integrator": "sdirk2", "preconditioner": "multilevel", "step_error": 1e-2}, True),
+        ("general", {"integrator": "implicit-midpoint", "precision": "single"}, True),
     ],
     ids=str,
 )
-def test_arrays_are_as_declared(options, sliding):
-    simulator = wy.Simulator(scene("twill", None, sliding), chunk=3, **options)
+def test_arrays_are_as_declared(name, options, sliding):
+    simulator = wy.Simulator(scene(name, None, sliding), chunk=3, **options)
     simulator.run(2)
     arrays = simulator.arrays
-    nodes, segments = 36, 2 * 6 * 5
-    sizes = {"world": 1, "node": nodes, "segment": segments, "yarn": 12, "crossing": 16, "frame node": 4 * nodes}
+    rows, columns = simulator.scene.cloth.weave.flipped.shape
+    nodes, crossings = rows * columns, (rows - 2) * (columns - 2)
+    segments = rows * (columns - 1) + columns * (rows - 1)
+    sizes = {"world": 1, "node": nodes, "segment": segments, "yarn": rows + columns, "crossing": crossings}
+    sizes["frame node"] = 4 * nodes
+    numbers = {"gap": 4 * nodes, "half": 3 * (rows + columns), "corner": 4 * crossings, "cloth crossing": nodes}
+    sizes |= numbers if name == "general" else dict.fromkeys(numbers, 1)
     for name, array in arrays.items():
         if name == "levels":
             continue

@@ -38,19 +38,19 @@ def test_barrier_is_twice_differentiable_where_it_ends(case: Case) -> None:
     """Just within its reach its force is the square of the way, so that neither force nor matrix has a jump."""
     sim, c = case.simulator("parallel"), case.cloth
     a, b = c.node(1, 1), c.node(1, 2)
+    k, _, stiffness, reach = (float(p[c.columns]) for p in case.oracle("parallel").parallel.parameters)
 
     def force(rest: float) -> float:
         euler = c.euler.copy()
-        euler[b, 0] = euler[a, 0] + rest * 0.2 * c.radius
+        euler[b, 0] = euler[a, 0] + rest * reach
         return float(sim.forces(dataclasses.replace(sim.state, euler=euler, anchor=None))["parallel"][1][a, 0])
 
     penalty = force(1.5)
     within = [force(x) - penalty for x in (0.99, 0.98)]
     # the penalty goes on linearly
-    slope = c.parallel_stiffness * c.spacing * 0.2 * c.radius
+    slope = k * reach
     guard = [-(f + slope * (1.5 - x)) for f, x in zip(within, (0.99, 0.98), strict=True)]
     # 2 left log + left²/x of left = 1 − x is 3 left² to within left
-    stiffness = c.yarns[c.warp[1]].stretch * np.pi * c.radius**2 + c.parallel_stiffness * c.spacing
     assert guard[0] == pytest.approx(stiffness * 3.0 * 0.01**2, rel=0.02)
     assert guard[1] == pytest.approx(stiffness * 3.0 * 0.02**2, rel=0.04)
 

@@ -28,7 +28,9 @@ class Parameter:
     """What is to be learned, in its own unit.
 
     Args:
-        name: "density[k]", "stretch[k]", "bend[k]" of material k; a number of the cloth, such as "shear" or "friction";
+        name: "density[k]", "stretch[k]", "bend[k]" of material k; a number of the cloth, such as "shear" or "friction",
+            with the place in the flattened array where the cloth has more than one ("shear[1]" of warp yarns of
+            material 0 and weft yarns of material 1; "friction[7]" of node 7);
             "wind_velocity[k]", "wind_density", "wind_drag", "gravity[k]" or "pin_stiffness", where the scene has them;
             a parameter of a registered term of the scene, with an index where it is a vector or the yarns'.
         low, high: the range, its ends included; low below high.
@@ -72,7 +74,10 @@ def split(name: str) -> tuple[str, int | None]:
 
 def learnable(scene: Scene) -> dict[str, int | None]:
     """Lists what can be learned of a scene: the name, and how many numbers it has; None: one, which takes no index."""
-    result: dict[str, int | None] = {**dict.fromkeys(OF_YARNS, len(scene.cloth.yarns)), **dict.fromkeys(OF_CLOTHS)}
+    result: dict[str, int | None] = dict.fromkeys(OF_YARNS, len(scene.cloth.yarns))
+    for name in OF_CLOTHS:
+        value = getattr(scene.cloth, name)
+        result[name] = value.size if np.ndim(value) else None
     if scene.wind is not None:
         result |= {"wind_velocity": 3, "wind_density": None, "wind_drag": None}
     if scene.gravity is not None:
@@ -98,7 +103,7 @@ def value_of(scene: Scene, name: str) -> float:
     if base in OF_YARNS and k is not None:
         return float(getattr(scene.cloth.yarns[k], base))
     if base in OF_CLOTHS:
-        return float(getattr(scene.cloth, base))
+        return float(np.ravel(getattr(scene.cloth, base))[k or 0])
     if base in scene.registered:
         return float(scene.registered_value(base)[() if k is None else k])
     value = getattr(scene.wind, OF_WINDS[base]) if base in OF_WINDS else getattr(scene, base)
@@ -120,7 +125,11 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
         dataclasses.replace(yarn, **{base: value for (base, j), value in parts.items() if base in OF_YARNS and j == k})
         for k, yarn in enumerate(old.yarns)
     ]
-    numbers = {name: parts.get((name, None), getattr(old, name)) for name in CLOTH_NUMBERS}
+    numbers = {name: parts.get((name, None), getattr(old, name)) for name in OF_CLOTHS}
+    for (name, k), value in parts.items():
+        if name in OF_CLOTHS and k is not None:
+            numbers[name] = np.array(numbers[name])
+            numbers[name].flat[k] = value
     changes["cloth"] = old.replace(yarns=yarns, pose=old.position, **numbers)
     if scene.wind is not None:
         velocity: Any = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
@@ -163,6 +172,7 @@ def as_inputs(scene: Scene, names: Sequence[str], values: np.ndarray) -> dict[st
             own: Any = (
                 value_of(scene, base) if count is None else [value_of(scene, f"{base}[{j}]") for j in range(count)]
             )
-            arrays[base] = np.array(own)
-        arrays[base][() if k is None else k] = value
+            shape = np.shape(getattr(scene.cloth, base)) if base in OF_CLOTHS else np.shape(own)
+            arrays[base] = np.reshape(own, shape)
+        arrays[base].reshape(-1)[k or 0] = value
     return arrays

@@ -207,8 +207,8 @@ class CalibrationProblem:
         loss = self._run(inputs).square().sum()
         self.gradients += self.cost
         loss.backward()
-        parts = [(inputs[base].grad, k) for base, k in map(split, self.names)]
-        return float(loss.detach()), np.array([float(part if k is None else part[k]) for part, k in parts])
+        parts = [(inputs[base].grad.reshape(-1), k) for base, k in map(split, self.names)]
+        return float(loss.detach()), np.array([float(part[k or 0]) for part, k in parts])
 
     def jacobian(self, values: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """Estimates ∂residuals/∂y [residuals, parameters] at values with these residuals, y as of ``scaled``.

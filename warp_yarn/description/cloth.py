@@ -1,4 +1,4 @@
-"""Yarns, and the cloth that is woven of them."""
+"""The cloth that is woven of yarns."""
 
 from __future__ import annotations
 
@@ -9,38 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, NoAttributeError, choice, finite_array, indices, real
+from ..errors import InputError, choice, finite_array, real
 from .topology import Topology, rectangle
 from .weave import Weave
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Yarn:
-    """A yarn material (paper, table 1).
-
-    Args:
-        density: ρ, mass per length [kg/m], above 0.
-        stretch: Y, stretch modulus [Pa], at least 0. The stiffness of a yarn is kₛ = Y π R² [N].
-        bend: B, bending modulus [Pa m²], at least 0. The stiffness of a yarn is k_b = B π R² [N m²].
-        color: red, green, blue from 0 to 1, for pictures; None: chosen by its place in the cloth's list.
-    """
-
-    density: float
-    stretch: float
-    bend: float
-    color: tuple[float, float, float] | None = None
-
-    def __post_init__(self) -> None:
-        keep = functools.partial(object.__setattr__, self)  # frozen
-        keep("density", real("density", self.density, above=0.0))
-        keep("stretch", real("stretch", self.stretch, least=0.0))
-        keep("bend", real("bend", self.bend, least=0.0))
-        if self.color is not None:
-            color = finite_array("color", self.color, (3,))
-            if color.min() < 0.0 or color.max() > 1.0:
-                raise InputError(f"color = {self.color}, must be three numbers from 0 to 1")
-            keep("color", tuple(color.tolist()))
-
+from .woven import (
+    OF_CROSSINGS,
+    Each,
+    Numbers,
+    Woven,
+    check_room,
+    checked_crimp,
+    checked_materials,
+    checked_of_crossings,
+    checked_spacing,
+)
+from .yarn import Yarn
 
 CLOTH_NUMBERS = (
     "spacing",
@@ -57,64 +40,36 @@ CLOTH_NUMBERS = (
 POSES = ("upright", "flat")
 
 
-class Fixed:
-    """What cannot be changed once it is made: simulators take its values when they are made themselves."""
-
-    _arguments: dict[str, Any]
-    """All that it was made of."""
-
-    def _fix(self, **arguments: Any) -> None:
-        """Ends the making: arrays and attributes are read-only from now on."""
-        self._arguments = arguments
-        for value in vars(self).values():
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if "_arguments" in vars(self):
-            kind = type(self).__name__
-            raise NoAttributeError(
-                f"{kind.lower()}.{name} cannot be set: a {kind} does not change once it is made, and simulators would "
-                f"not know; make another one, such as by {kind.lower()}.replace({name}=...)"
-            )
-        super().__setattr__(name, value)
-
-    def __delattr__(self, name: str) -> None:
-        raise NoAttributeError(f"{type(self).__name__.lower()}.{name} cannot be deleted")
-
-    def replace(self, **changes: Any) -> Any:
-        """Makes another one, of the same arguments but for these.
-
-        Raises:
-            InputError: an argument that there is not, or a value that does not go with the others.
-        """
-        for name in changes:
-            if name not in self._arguments:
-                raise InputError(f"replace({name}=...): must be one of {', '.join(self._arguments)}")
-        return type(self)(**{**self._arguments, **changes})
-
-
-class Cloth(Fixed):
+class Cloth(Woven):
     """A rectangle of woven cloth at rest.
 
     Node (row j, column i) has index i + j·columns. Warp yarn j runs through row j, along u; weft yarn i through
-    column i, along v. At rest (u, v) = (i L, j L).
+    column i, along v. Where all yarns are equally far apart, (u, v) = (i L, j L) at rest.
 
     Args:
         weave: the draft.
         yarns: the materials.
         warp, weft: the material (an index into yarns) of each warp yarn [rows] and weft yarn [columns]. None: they
             alternate, even yarns of the first material, odd ones of the second, and so on.
-        spacing: L, distance of neighbouring crossings [m], above 0.
-        radius: R of every yarn [m], above 0 and at most half the spacing.
-        shear: S, shear modulus of a crossing [Pa], at least 0.
+        spacing: L, distance of neighbouring yarns [m], above 0: one of all, or (warp, weft), that of neighbouring warp
+            yarns (of rows, so the length of weft segments) and that of neighbouring weft yarns (of columns, the length
+            of warp segments), each a number or one for each gap [rows − 1], [columns − 1].
+        radius: R of yarns that have no size of their own [m], above 0. Neighbouring yarns must not overlap: half the
+            sum of their widths is at most their distance.
+        crimp: how much longer than the distance that it covers at rest a yarn is, over that distance, at least 0: one
+            of all, or (warp, weft), each a number or one for each yarn [rows], [columns]. (u, v) are lengths of yarn,
+            1 + crimp times the distances; a yarn is unstrained as woven, and its crimp stays the same as it stretches.
+        shear: S, shear modulus of a crossing [Pa], at least 0. One number, or one for each pair of materials
+            [materials of warp yarns, materials of weft yarns], or one for each node [nodes], of which those on the
+            border mean nothing; as are the next three.
         friction: μ, friction coefficient of a crossing, at least 0.
         friction_stiffness: k_f, spring of a stuck crossing [N/m], above 0.
         friction_damping: d_f, damping of sliding [N s/m], at least 0; None: critical for the spring of a stuck
             crossing, 2 √(k_f m), m the mean mass of a yarn's part at a crossing.
         friction_sharpness: p of eq. 4, how sharply a crossing breaks away, above 0.
         parallel_stiffness: k_c, repulsion of parallel yarns [N/m], at least 0.
-        pose: "upright", (i L, 0, (rows − 1 − j) L); "flat", (i L, j L, 0); or positions, nodes × 3 [m].
+        pose: "upright", (x, 0, height − y) of a node x along u and y along v from the first one; "flat", (x, y, 0); or
+            positions, nodes × 3 [m].
     """
 
     def __init__(
@@ -124,12 +79,13 @@ class Cloth(Fixed):
         yarns: Sequence[Yarn],
         warp: Sequence[int] | np.ndarray | None = None,
         weft: Sequence[int] | np.ndarray | None = None,
-        spacing: float = 1e-3,
+        spacing: Each = 1e-3,
         radius: float = 5e-4,
-        shear: float = 1000.0,
-        friction: float = 0.5,
-        friction_stiffness: float = 1000.0,
-        friction_damping: float | None = None,
+        crimp: Each = 0.0,
+        shear: Each = 1000.0,
+        friction: Each = 0.5,
+        friction_stiffness: Each = 1000.0,
+        friction_damping: Each | None = None,
         friction_sharpness: float = 10.0,
         parallel_stiffness: float = 1.0,
         pose: Any = "upright",
@@ -142,48 +98,54 @@ class Cloth(Fixed):
         self.yarns = tuple(yarns)
         if not self.yarns or not all(isinstance(yarn, Yarn) for yarn in self.yarns):
             raise InputError(f"yarns = {yarns!r}, must be a list of at least one Yarn")
-        self.warp = self._materials("warp", warp, weave.rows)
-        self.weft = self._materials("weft", weft, weave.columns)
-        self.spacing = real("spacing", spacing, above=0.0)
+        self.warp = checked_materials("warp", warp, weave.rows, len(self.yarns))
+        self.weft = checked_materials("weft", weft, weave.columns, len(self.yarns))
+        self.spacing = checked_spacing(spacing, weave.rows, weave.columns)
         self.radius = real("radius", radius, above=0.0)
-        if self.radius > 0.5 * self.spacing * (1.0 + 1e-12):
-            raise InputError(
-                f"radius = {radius:g}, must be at most half the spacing ({0.5 * self.spacing:g}), or neighbouring "
-                "yarns overlap"
-            )
-        self.shear = real("shear", shear, least=0.0)
-        self.friction = real("friction", friction, least=0.0)
-        self.friction_stiffness = real("friction_stiffness", friction_stiffness, above=0.0)
-        damping = friction_damping
-        if damping is None:
-            mass = np.mean([self.yarns[k].density for k in self.material]) * self.spacing
-            damping = 2.0 * float(np.sqrt(self.friction_stiffness * mass))
-        self.friction_damping = real("friction_damping", damping, least=0.0)
+        self.crimp = checked_crimp(crimp, weave.rows, weave.columns)
+        self._measure()
+        self.shear = self._of_crossings("shear", shear)
+        self.friction = self._of_crossings("friction", friction)
+        self.friction_stiffness = self._of_crossings("friction_stiffness", friction_stiffness)
+        if friction_damping is None:
+            damping = 2.0 * np.sqrt(self.friction_stiffness * self.segment_mass)
+            self.friction_damping: Numbers = float(damping) if np.ndim(damping) == 0 else damping
+        else:
+            self.friction_damping = self._of_crossings("friction_damping", friction_damping)
         self.friction_sharpness = real("friction_sharpness", friction_sharpness, above=0.0)
         self.parallel_stiffness = real("parallel_stiffness", parallel_stiffness, least=0.0)
         self.position = self._pose(pose)
+        every = (self.spacing, self.crimp, *(getattr(self, name) for name in OF_CROSSINGS))
+        self.general = bool(
+            not all(isinstance(value, float) for value in every) or self.crimp or (self.halves != self.radius).any()
+        )
         self._fix(
             weave=weave,
             yarns=self.yarns,
             warp=None if warp is None else self.warp,
             weft=None if weft is None else self.weft,
-            **{name: getattr(self, name) for name in CLOTH_NUMBERS if name != "friction_damping"},
+            **{name: getattr(self, name) for name in CLOTH_NUMBERS if name not in ("radius", "friction_damping")},
+            radius=float(radius),
+            crimp=self.crimp,
             friction_damping=None if friction_damping is None else self.friction_damping,
             pose=pose if isinstance(pose, str) else self.position,
         )
 
     def __repr__(self) -> str:
-        return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"
+        if isinstance(self.spacing, float):
+            return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {self.spacing:g} m)"
+        warp, weft = (f"{np.mean(each):g}" for each in self.spacing)
+        return f"Cloth({self.weave}, {len(self.yarns)} yarns, spacing {warp} m × {weft} m)"
 
     def same_as(self, other: Any) -> bool:
         """Tells whether another one is made of the same, whatever their weaves are called."""
+        arrays = (*CLOTH_NUMBERS[2:], "warp", "weft", "rest_grid", "halves", "yarn_crimp", "position")
         return (
             isinstance(other, Cloth)
             and np.array_equal(self.weave.flipped, other.weave.flipped)
             and [dataclasses.replace(yarn, color=None) for yarn in self.yarns]
             == [dataclasses.replace(yarn, color=None) for yarn in other.yarns]
-            and all(getattr(self, name) == getattr(other, name) for name in CLOTH_NUMBERS)
-            and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in ("warp", "weft", "position"))
+            and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in arrays)
         )
 
     @property
@@ -191,24 +153,19 @@ class Cloth(Fixed):
         return self.weave.rows * self.weave.columns
 
     @functools.cached_property
-    def topology(self) -> Topology:
+    def topology(self) -> Topology:  # type: ignore[override]
         return rectangle(self.weave)
 
     @property
-    def material(self) -> np.ndarray:
+    def material(self) -> np.ndarray:  # type: ignore[override]
         """Material of every yarn, the warp yarns first [rows + columns]."""
         return np.concatenate([self.warp, self.weft])
 
     @property
     def stretch_stiffness(self) -> np.ndarray:
-        """kₛ = Y π R² of every material [materials] (N)."""
-        return np.array([yarn.stretch for yarn in self.yarns]) * np.pi * self.radius**2
-
-    @property
-    def euler(self) -> np.ndarray:
-        """(u, v) of every node at rest [nodes, 2]."""
-        row, column = np.divmod(np.arange(self.nodes), self.weave.columns)
-        return np.stack([column, row], axis=1) * self.spacing
+        """kₛ = Y · section of every material [materials] (N)."""
+        halves = np.array([yarn.halves(self.radius) for yarn in self.yarns])
+        return np.array([yarn.stretch for yarn in self.yarns]) * np.pi * (halves[:, 0] * halves[:, 1])
 
     def node(self, row: int, column: int) -> int:
         """Gives the index of a node; negative rows and columns count from the end."""
@@ -231,8 +188,8 @@ class Cloth(Fixed):
 
     @property
     def rest_place(self) -> np.ndarray:
-        """(u, v) at rest [nodes, 2], by which arcs along the cloth are compared (m)."""
-        return self.euler
+        """Where nodes are at rest along u and v [nodes, 2], by which arcs along the cloth are compared (m)."""
+        return self.rest_grid
 
     def corners(self, which: str = "all") -> list[int]:
         """Lists the nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
@@ -241,22 +198,44 @@ class Cloth(Fixed):
         bottom = [self.node(-1, 0), self.node(-1, -1)]
         return {"top": top, "bottom": bottom, "all": top + bottom}[which]
 
-    def _materials(self, name: str, value: Sequence[int] | np.ndarray | None, count: int) -> np.ndarray:
-        if value is None:
-            return np.arange(count) % len(self.yarns)
-        if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or np.ndim(value) == 0:
-            raise InputError(f"{name} = {value!r}, must be the materials of {count} yarns, a list of whole numbers")
-        if len(value) != count:
-            raise InputError(f"{name} names the material of {len(value)} yarns, must be of {count}")
-        for k in value:
-            indices(name, [k], len(self.yarns), "material")
-        return np.array(value)
+    def _measure(self) -> None:
+        """Finds where nodes are at rest, sizes and crimps of yarns, and (u, v)."""
+        rows, columns = self.weave.rows, self.weave.columns
+        row, column = np.divmod(np.arange(self.nodes), columns)
+        halves = np.array([yarn.halves(self.radius) for yarn in self.yarns])
+        self.halves = halves[self.material]
+        if (self.halves == self.halves[0, 0]).all():
+            self.radius = float(self.halves[0, 0])
+        self.yarn_crimp = np.zeros(rows + columns)
+        if isinstance(self.spacing, float):
+            self.rest_grid = np.stack([column, row], axis=1) * self.spacing
+            if (self.halves == self.radius).all() and self.radius > 0.5 * self.spacing * (1.0 + 1e-12):
+                raise InputError(
+                    f"radius = {self.radius:g}, must be at most half the spacing ({0.5 * self.spacing:g}), or "
+                    "neighbouring yarns overlap"
+                )
+            gaps: tuple[Numbers, Numbers] = self.spacing, self.spacing
+        else:
+            gaps = self.spacing
+            v = np.append(0.0, np.cumsum(np.broadcast_to(gaps[0], rows - 1)))
+            u = np.append(0.0, np.cumsum(np.broadcast_to(gaps[1], columns - 1)))
+            self.rest_grid = np.stack([u[column], v[row]], axis=1)
+        check_room(gaps[0], self.halves[:rows, 0], "warp")
+        check_room(gaps[1], self.halves[rows:, 0], "weft")
+        crimp = self.crimp
+        self.euler = self.rest_grid
+        if crimp:
+            warp, weft = (crimp, crimp) if isinstance(crimp, float) else crimp
+            self.yarn_crimp = np.concatenate([np.broadcast_to(warp, rows), np.broadcast_to(weft, columns)])
+            self.euler = self.rest_grid * (1.0 + self.yarn_crimp[np.stack([row, rows + column], axis=1)])
+
+    def _of_crossings(self, name: str, value: Any) -> Numbers:
+        return checked_of_crossings(name, value, self.nodes, len(self.yarns))
 
     def _pose(self, pose: Any) -> np.ndarray:
         if not isinstance(pose, str):
             return finite_array("pose", pose, (self.nodes, 3))
         choice("pose", pose, POSES)
-        u, v = self.euler.T
+        u, v = self.rest_grid.T
         zero = np.zeros_like(u)
-        height = (self.weave.rows - 1) * self.spacing
-        return np.stack([u, zero, height - v] if pose == "upright" else [u, v, zero], axis=1)
+        return np.stack([u, zero, v[-1] - v] if pose == "upright" else [u, v, zero], axis=1)

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, real
-from .cloth import Fixed
+from .fixed import Fixed
 
 ROUNDING = 1e-15
 """Of a length of 1: what was normalized stays as it is, to the last bit."""
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 SAMPLES = ("nodes",)
-METHODS = ("barrier",)
+METHODS = ("barrier", "impact-zones")
 SPEED = 3.0
 """Of a node whose kinetic energy the default stiffness stops within its range [m/s]: fabric that falls or is thrown."""
 
@@ -241,20 +241,32 @@ class TriangleMesh(Obstacle):
 
 
 class Contact(Fixed):
-    """The law of contact (``kernels/contact/barrier.py`` has its formulas).
+    """The law of contact (``kernels/contact/barrier.py`` has its formulas), or the paper's impact zones.
+
+    A barrier pushes within the implicit stage, with friction: the integrators are "implicit-euler" and "sdirk2".
+
+    Impact zones put the end of a step where nothing has met (``warp_yarn/device/impact_zones.py``): the integrator is
+    "linear", obstacles are Plane, Box and TriangleMesh, stand still and have friction 0, what touches are the triangles
+    through the crossings, and there is no friction. Of the options below they have ``thickness`` alone.
 
     Args:
-        method: "barrier".
+        method: "barrier" or "impact-zones".
         stiffness: κ of a contact [N/m], above 0; None: m (3 m/s / range)², m the mean mass of a node.
-        distance: D, how near nodes may come to obstacles [m], above 0; None: the yarns' radius.
-        range: d̂, beyond D, over which obstacles push [m], above 0; None: the yarns' radius.
-        self_distance: D of cloth on cloth, between nodes [m], above 0; None: 1.5 spacings, or 3 radii if that is more.
-        self_range: d̂ of cloth on cloth [m], above 0; None: the spacing.
-        friction: μ of cloth on cloth, at least 0. (Each obstacle has its own.)
+        distance: D, how near nodes may come to obstacles [m], above 0; None: the yarns' radius, half
+            the thickness of the thickest.
+        range: d̂, beyond D, over which obstacles push [m], above 0; None: the same.
+        self_distance: D of cloth on cloth, between nodes [m], above 0; None: 1.5 spacings, of the
+            longest, or 3 of those radii if that is more.
+        self_range: d̂ of cloth on cloth [m], above 0; None: that spacing.
+        friction: μ of cloth on cloth, at least 0; None: 0.3 of a barrier. (Each obstacle has its own.)
         slip_speed: ε, at which friction reaches μ f_n [m/s], above 0: what sticks creeps, at ε (1 − √(1 − r)) under a
             share r of that.
         damping_speed: v_d of normal damping [m/s], above 0; None: no damping.
         samples: what touches: "nodes".
+        thickness: of impact zones, by which what has met is put apart [m], above 0; None: a tenth of the spacing.
+
+    Raises:
+        InputError: an option of the other method.
     """
 
     def __init__(
@@ -266,10 +278,11 @@ class Contact(Fixed):
         range: float | None = None,
         self_distance: float | None = None,
         self_range: float | None = None,
-        friction: float = 0.3,
+        friction: float | None = None,
         slip_speed: float = 1e-3,
         damping_speed: float | None = 0.5,
         samples: str = "nodes",
+        thickness: float | None = None,
     ):
         def optional(name: str, value: Any) -> float | None:
             return None if value is None else real(name, value, above=0.0)
@@ -280,11 +293,45 @@ class Contact(Fixed):
         self.range = optional("contact range", range)
         self.self_distance = optional("contact self_distance", self_distance)
         self.self_range = optional("contact self_range", self_range)
+        if friction is None:
+            friction = 0.3 if self.method == "barrier" else 0.0
         self.friction = real("contact friction", friction, least=0.0)
         self.slip_speed = real("contact slip_speed", slip_speed, above=0.0)
         self.damping_speed = optional("contact damping_speed", damping_speed)
         self.samples = choice("contact samples", samples, SAMPLES)
+        self.thickness = optional("contact thickness", thickness)
+        self._refuse_options()
         self._fix(**vars(self))
+
+    def _refuse_options(self) -> None:
+        """Refuses options that the method does not have."""
+        if self.method == "barrier":
+            if self.thickness is not None:
+                raise InputError(f"contact thickness = {self.thickness:g} with a barrier: must be None")
+            return
+        lengths = ("stiffness", "distance", "range", "self_distance", "self_range")
+        wanted = {**dict.fromkeys(lengths), "friction": 0.0, "slip_speed": 1e-3, "damping_speed": 0.5}
+        for name, value in wanted.items():
+            if getattr(self, name) != value:
+                raise InputError(
+                    f"contact {name} = {getattr(self, name)} with impact zones, which have thickness alone: "
+                    f"must be {value}, its default"
+                )
+
+    def check_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Refuses obstacles that impact zones cannot keep cloth from.
+
+        Raises:
+            InputError: such an obstacle.
+        """
+        for k, obstacle in enumerate(obstacles if self.method == "impact-zones" else ()):
+            name = f"obstacles[{k}] with impact zones"
+            if not isinstance(obstacle, Plane | Box | TriangleMesh):
+                raise InputError(f"{name} is a {type(obstacle).__name__}, must be a Plane, a Box or a TriangleMesh")
+            if obstacle.friction != 0.0:
+                raise InputError(f"{name} has friction = {obstacle.friction:g}, must be 0: they know none")
+            if obstacle.path is not None:
+                raise InputError(f"{name} has a path, must be None: it has to stand still")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Contact) and self._arguments == other._arguments

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, indices, real
-from ..kernels import TERMS, Term, TermParameter, in_order, own, parameters
-from .cloth import Cloth, Fixed
+from ..errors import InputError, finite_array, indices, real
+from ..kernels import TERMS, TermParameter, own
+from .cloth import Cloth
 from .cloths import Cloths, as_one
+from .crimp import check_crimp
+from .fixed import Fixed
 from .obstacles import Contact, Obstacle
+from .selection import checked_parameters, selected_terms
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,6 +65,11 @@ class Scene(Fixed):
         obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
         self_contact: whether the cloth may touch itself; else it passes through itself.
         contact: the law of contact; None: as ``Contact()``.
+        contact_force: what presses warp and weft together at a crossing: "published", eq. 3, whose stretch forces are
+            those of the straight segments; "crimped", of segments that rise by the crimp of the yarns, so that a flat
+            cloth's feels their tension.
+        crimp_interchange: whether yarns that are crimped straighten at each other's expense before they stretch: the
+            term of that name, in place of stretch, with a contact force of its own. Yarns must be crimped as woven.
     """
 
     def __init__(
@@ -81,6 +89,8 @@ class Scene(Fixed):
         obstacles: Sequence[Obstacle] = (),
         self_contact: bool = False,
         contact: Contact | None = None,
+        contact_force: str = "published",
+        crimp_interchange: bool = False,
     ):
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
@@ -97,7 +107,7 @@ class Scene(Fixed):
         self.force_path = _force_path(checked)
         self.sliding = bool(sliding)
         self.published_scaling = bool(published_scaling)
-        self._parameters = self._checked_parameters(parameters)
+        self._parameters = checked_parameters(parameters, len(self.cloth.yarns))
         if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
             raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
         self.obstacles = tuple(obstacles)
@@ -105,7 +115,11 @@ class Scene(Fixed):
         if contact is not None and not isinstance(contact, Contact):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
-        self.terms = self._terms(terms)
+        self.contact.check_obstacles(self.obstacles)
+        self.contact_force = contact_force
+        self.crimp_interchange = bool(crimp_interchange)
+        check_crimp(self.cloth, contact_force, self.crimp_interchange)
+        self.terms = selected_terms(self, terms)
         self._fix(
             cloth=self.cloth,
             gravity=self.gravity,
@@ -121,10 +135,22 @@ class Scene(Fixed):
             obstacles=self.obstacles,
             self_contact=self.self_contact,
             contact=contact,
+            contact_force=self.contact_force,
+            crimp_interchange=self.crimp_interchange,
         )
 
     def __repr__(self) -> str:
         return f"Scene({self.cloth}, terms {', '.join(self.terms)}, sliding {self.sliding})"
+
+    @property
+    def has_barrier(self) -> bool:
+        """Tells whether what touches does so by a barrier."""
+        return self.contact.method == "barrier"
+
+    @property
+    def has_impact_zones(self) -> bool:
+        """Tells whether impact zones keep the cloth from obstacles and itself."""
+        return self.contact.method == "impact-zones" and (bool(self.obstacles) or self.self_contact)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -169,6 +195,8 @@ class Scene(Fixed):
             "parameters",
             "self_contact",
             "contact",
+            "contact_force",
+            "crimp_interchange",
         )
         return (
             self.cloth.same_as(other.cloth)
@@ -178,60 +206,6 @@ class Scene(Fixed):
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
-
-    def _terms(self, names: Sequence[str] | None) -> tuple[str, ...]:
-        if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
-            raise InputError(f"terms = {names!r}, must be a list of names")
-        names = None if names is None else tuple(names)
-        known = in_order()
-        missing = {name: reason for name, term in known.items() if (reason := self._lacks(term))}
-        if names is None:
-            given = {name for name, term in known.items() if any(p.name in self._parameters for p in term.parameters)}
-            return tuple(name for name, term in known.items() if name not in missing and (own(term) or name in given))
-        for name in names:
-            choice("terms", name, known)
-            if name in missing:
-                raise InputError(f"terms names {name!r}, but {missing[name]}")
-        return tuple(name for name in known if name in names or name == "mass")
-
-    def _lacks(self, term: Term) -> str:
-        """Says why the scene has no use for a term, or ""."""
-        if term.sliding_only and not self.sliding:
-            return "yarns do not slide (sliding=False)"
-        for parameter in () if own(term) else term.parameters:
-            if parameter.default is None and parameter.name not in self._parameters:
-                return f"parameters has no {parameter.name!r}"
-        return term.absent(self) if term.absent is not None else ""
-
-    def _checked_parameters(self, given: Any) -> dict[str, Any]:
-        """Checks {name: value}, each as ``checked_parameter`` leaves it."""
-        if given is None:
-            return {}
-        if not isinstance(given, Mapping):
-            raise InputError(f"parameters = {given!r}, must be a dictionary, {{name: value}}")
-        known = {p.name: p for term in in_order().values() if not own(term) for p in term.parameters}
-        others, result = parameters(), {}
-        for name, value in given.items():
-            if name not in known and name in others:
-                raise InputError(
-                    f"parameters names {name!r}, must be given to Yarn, Cloth, Wind or Scene by its argument"
-                )
-            if name not in known:
-                raise InputError(
-                    f"parameters names {name!r}, must be of a registered term: {', '.join(known) or 'there is none'}"
-                )
-            result[name] = checked_parameter(known[name], value, len(self.cloth.yarns))
-        return result
-
-
-def checked_parameter(parameter: TermParameter, value: Any, materials: int) -> Any:
-    """Checks a value of a term's parameter: a number, 3 numbers of a vector, or one for each material."""
-    if parameter.size == 3:
-        return tuple(finite_array(parameter.name, value, (3,)).tolist())
-    if parameter.of == "yarn" and not np.isscalar(value):
-        values = finite_array(parameter.name, value, (materials,)).tolist()
-        return tuple(real(f"{parameter.name}[{k}]", v, **parameter.range) for k, v in enumerate(values))
-    return real(parameter.name, value, **parameter.range)
 
 
 def _checked_forces(forces: Any) -> dict[int, np.ndarray]:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, integer
+from ..errors import InputError, choice, integer
+from . import notation
 
 
 class Weave:
     """The draft of a cloth of rows × columns crossing nodes.
+
+    The face of a cloth is the side where a flipped crossing has its warp yarn on top: z+ of a flat cloth, y+ of an
+    upright one. Seen from there with the weft yarns counted upwards, warp yarns are counted from the right to the left.
+    So the first end of weavers' drafts, which is on the left where the first pick is at the bottom, is the last row.
 
     Args:
         draft: 0/1 array, rows × columns, at least 3 × 3. 1 where the crossing is flipped: the weft passes on the other
@@ -53,6 +60,51 @@ class Weave:
         return self.flipped.shape[1]
 
     @classmethod
+    def from_drawdown(
+        cls, warp_on_top: Any, *, rows: int | None = None, columns: int | None = None, name: str = "draft"
+    ) -> Weave:
+        """Takes what weavers draw: the face, picks upwards, ends to the right.
+
+        Args:
+            warp_on_top: 0/1 array [picks, ends], 1 where the end is over the pick; row 0 is the first pick, column 0
+                the first end.
+            rows, columns: number of warp and of weft yarns, at least 3, for which it is repeated, or cut; None: as many
+                as it has ends, and picks.
+            name: what to call it in messages and files.
+        """
+        try:
+            drawn = np.asarray(warp_on_top)
+        except ValueError:  # ragged
+            drawn = np.zeros(0)
+        if drawn.ndim != 2 or not drawn.size:
+            raise InputError("warp_on_top must be a two-dimensional array of 0 and 1, picks × ends")
+        picks, ends = drawn.shape
+        end = np.arange(integer("rows", ends if rows is None else rows, least=3)) % ends
+        pick = np.arange(integer("columns", picks if columns is None else columns, least=3)) % picks
+        return cls(drawn[np.ix_(pick, end)].T[::-1], name)
+
+    @classmethod
+    def from_notation(cls, text: str, *, rows: int, columns: int) -> Weave:
+        """Makes a weave of the words that weavers have for it, such as "2/2 twill Z" or "satin 5/2".
+
+        Args:
+            text: the words: those of ``warp_yarn.description.notation.repeat``. A twill without a letter is a twill Z,
+                which rises to the right on the face. (``Weave.twill`` and ``Weave.satin`` are the paper's.)
+            rows, columns: number of warp and of weft yarns, at least 3.
+        """
+        return cls.from_drawdown(notation.repeat(text), rows=rows, columns=columns, name=" ".join(text.split()))
+
+    @property
+    def warp_on_top(self) -> np.ndarray:
+        """The drawdown, as of ``from_drawdown`` [columns, rows], on the border too, where nothing crosses."""
+        return self.draft[::-1].T
+
+    def drawdown(self, path: str | os.PathLike) -> None:
+        """Draws it as weavers do: see ``wy.write_drawdown``."""
+        # by name: descriptions know nothing of what shows them, and need none of it
+        importlib.import_module("warp_yarn.view.drawdown").write_drawdown(path, self)
+
+    @classmethod
     def plain(cls, *, rows: int, columns: int) -> Weave:
         """Goes over one, under one."""
         j, i = _grid(rows, columns)
@@ -81,3 +133,25 @@ def _grid(rows: int, columns: int) -> np.ndarray:
 
 WEAVES = {"plain": Weave.plain, "twill": Weave.twill, "satin": Weave.satin}
 """The paper's weaves by name (figure 5)."""
+
+
+def woven(weave: Any, *, rows: int, columns: int) -> Weave:
+    """Makes a weave of what a fabric may be asked for: one of ``WEAVES``, words of ``Weave.from_notation``, or a Weave.
+
+    Raises:
+        InputError: it is none of these, or a Weave of other numbers of yarns.
+    """
+    if isinstance(weave, Weave):
+        if (weave.rows, weave.columns) != (rows, columns):
+            raise InputError(
+                f"weave = {weave!r}: rows = {rows}, columns = {columns} must be the same, such as by rows=weave.rows, "
+                "columns=weave.columns"
+            )
+        return weave
+    if isinstance(weave, str) and any(character.isdigit() for character in weave):
+        return Weave.from_notation(weave, rows=rows, columns=columns)
+    try:
+        make = WEAVES[choice("weave", weave, WEAVES)]
+    except InputError as error:
+        raise InputError(f'{error}, or words such as "2/2 twill Z" and "satin 5/2", or a Weave') from None
+    return make(rows=rows, columns=columns)

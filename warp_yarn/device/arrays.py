@@ -14,10 +14,11 @@ from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
+from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
 from ..simulation.state import CLOTH_NUMBERS
-from . import contact, declarations
+from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
 
@@ -49,6 +50,7 @@ class Arrays(DeclaredArrays):
         sizes = {
             "world": 1,
             "cloth": 1,
+            **_number_sizes(scene.cloth, variant.general),
             "node": topology.nodes,
             "block": self.stencil * topology.nodes,
             "yarn": len(topology.yarn_direction),
@@ -70,12 +72,15 @@ class Arrays(DeclaredArrays):
         for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
             self.make(group)
         contact.set_arrays(self)
+        crimp.set_arrays(self)
 
     def node_mass(self) -> float:
         """Compute the mean mass of a node [kg]."""
         cloth = self.scene.cloth
         density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
-        return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
+        if not cloth.general:
+            return float(density[cloth.topology.segment_yarn].sum()) * cloth.spacing / cloth.nodes
+        return cloth.mass / cloth.nodes
 
     def _indices(self, name: str, values: np.ndarray) -> None:
         """Set an index array, or None where the scene has no use for it."""
@@ -94,6 +99,7 @@ class Arrays(DeclaredArrays):
             "segments": np.column_stack([topology.segment_nodes, yarn, topology.yarn_direction[yarn]]),
             "neighbour": topology.neighbour[:, : self.stencil].ravel(),
             "is_free": free,
+            "node_yarns": cloth.node_yarns.ravel() if "general" in self.conditions else None,
         }
         counts = {"nodes": topology.nodes, "columns": cloth.columns, "stencil": self.stencil}
         for name in declarations.TOPOLOGY:
@@ -106,9 +112,7 @@ class Arrays(DeclaredArrays):
         cloth = scene.cloth
         for name in YARN_PARAMETERS:
             self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
-        for name in CLOTH_NUMBERS:
-            self[name] = self.numbers(getattr(cloth, name))
-        self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
+        self._cloth_numbers(cloth)
         if scene.gravity is not None:
             self["gravity"] = self.numbers(scene.gravity[None])
         if scene.wind is not None:
@@ -137,6 +141,22 @@ class Arrays(DeclaredArrays):
             self.declare(name, Field(element, 1, kind, parameter.unit, "always", "of a term from outside the package"))
             value = scene.registered_value(name)
             self[name] = self.numbers(value[cloth.material] if parameter.of == "yarn" else value[None])
+
+    def _cloth_numbers(self, cloth: Cloth | Cloths) -> None:
+        """Fill what a cloth says in numbers: single ones, or in a general cloth those of every segment, yarn, ..."""
+        general = "general" in self.conditions
+        for name in CLOTH_NUMBERS:
+            if general and name in OF_CROSSINGS:
+                self[name] = self.numbers(cloth.at_nodes(name))
+            elif not general or name not in ("spacing", "radius"):
+                self[name] = self.numbers(getattr(cloth, name))
+        if general:
+            self["spacing"] = self.numbers(np.concatenate([cloth.node_spacing, cloth.node_widths]).ravel())
+            self["radius"] = self.numbers(np.append(cloth.halves, 1.0 + cloth.yarn_crimp))
+            self["lock_angle"] = self.numbers(cloth.corner_lock.ravel())
+        else:
+            self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
+        self["lengthening"] = self.numbers(1.0 + cloth.yarn_crimp) if general else None
 
     def add_frames(self, count: int) -> None:
         """Make room for so many frames of what moves, as ``frame_position`` and so on."""
@@ -183,3 +203,15 @@ class Arrays(DeclaredArrays):
         self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
         self.dims["coarse_warp_lines"] = found.coarse_warp_lines
         self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
+
+
+def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:
+    """Count what the numbers of a cloth are of: one of each in a plain cloth."""
+    topology = cloth.topology
+    counts = {
+        "gap": 4 * topology.nodes,
+        "half": 3 * len(topology.yarn_direction),
+        "corner": 4 * len(topology.crossing_node),
+        "cloth crossing": topology.nodes,
+    }
+    return counts if general else dict.fromkeys(counts, 1)

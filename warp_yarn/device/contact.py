@@ -1,4 +1,5 @@
-"""What a model's cloth touches: arrays of obstacles and of the law, and the host's side of ``kernels/contact``."""
+"""What a model's cloth touches by a barrier: arrays of obstacles and of the law, and the host's side of
+``kernels/contact``. (``impact_zones.py`` has the other method.)"""
 
 from __future__ import annotations
 
@@ -62,15 +63,15 @@ def _steps(scene: Scene) -> int:
 def set_arrays(arrays: Arrays) -> None:
     """Fill the arrays of a scene's contact."""
     scene, cloth, contact = arrays.scene, arrays.scene.cloth, arrays.scene.contact
-    if scene.obstacles:
-        _set_law(arrays, "contact", contact.distance or cloth.radius, contact.range or cloth.radius)
+    if "obstacles" in arrays.conditions:
+        _set_law(arrays, "contact", contact.distance or cloth.half_thickness, contact.range or cloth.half_thickness)
         _set_obstacles(arrays, scene)
-    if scene.self_contact:
-        distance = contact.self_distance or max(1.5 * cloth.spacing, 3.0 * cloth.radius)
-        reach = contact.self_range or cloth.spacing
+    if "self-contact" in arrays.conditions:
+        distance = contact.self_distance or max(1.5 * cloth.longest_spacing, 3.0 * cloth.half_thickness)
+        reach = contact.self_range or cloth.longest_spacing
         _set_law(arrays, "self_contact", distance, reach)
         arrays["contact_friction"] = arrays.numbers(contact.friction)
-        arrays["near_margin"] = arrays.numbers(NEAR_MARGIN * cloth.spacing)
+        arrays["near_margin"] = arrays.numbers(NEAR_MARGIN * cloth.longest_spacing)
         arrays["rest_place"] = arrays.numbers(cloth.rest_place.ravel())
     arrays["near_room"] = 0
     arrays["face_room"] = FACE_ROOM if arrays.sizes["near face"] else 0
@@ -134,7 +135,7 @@ def _quaternions(arrays: Arrays, values: np.ndarray) -> wp.array:
 
 
 class Contact:
-    """The contact of a model's cloth with obstacles and with itself.
+    """The contact of a model's cloth with obstacles and with itself, by a barrier.
 
     Attributes:
         on: whether the scene has any.
@@ -158,7 +159,7 @@ class Contact:
                 raise InputError("preconditioner = 'jacobi' with self_contact: must be 'multilevel' or 'incomplete'")
             a, cloth = model.arrays, scene.cloth
             self._reach = float(a["self_contact_distance"].numpy()[0] + a["self_contact_range"].numpy()[0])
-            side = int(np.clip(np.sqrt(cloth.nodes) * cloth.spacing / self._reach, 8, 128))
+            side = int(np.clip(np.sqrt(cloth.nodes) * cloth.longest_spacing / self._reach, 8, 128))
             self.grid = wp.HashGrid(side, side, side, device=a.device, dtype=a.variant.scalar)
             self.grid.reserve(cloth.nodes)
             self.make_room(NEAR_ROOM)

@@ -30,6 +30,7 @@ TOPOLOGY: Group = {
     "is_crossing": Field("node", 1, "int", "", "always", "1 at a crossing, 0 on the border"),
     "is_free": Field("node", 1, "int", "", "always", "0 where a hard pin holds a node, else 1"),
     "flipped": Field("node", 1, "int", "", "always", "the draft: which yarn is on top"),
+    "node_yarns": Field("node", 2, "int", "", "general", "its warp yarn and its weft yarn, or -1"),
     "neighbour": Field("block", 1, "int", "", "always", "upper neighbours of a node in the matrix, or -1"),
 }
 """Index arrays (``description/topology.py``)."""
@@ -38,18 +39,21 @@ PARAMETERS: Group = {
     "density": Field("yarn", 1, "scalar", "kg/m", "always", "ρ"),
     "stretch": Field("yarn", 1, "scalar", "Pa", "always", "stretch modulus Y"),
     "bend": Field("yarn", 1, "scalar", "Pa m²", "always", "bending modulus B"),
-    "spacing": Field("cloth", 1, "scalar", "m", "always", "L"),
-    "radius": Field("cloth", 1, "scalar", "m", "always", "R"),
-    "shear": Field("cloth", 1, "scalar", "Pa", "always", "shear modulus S"),
-    "friction": Field("cloth", 1, "scalar", "", "always", "μ"),
-    "friction_stiffness": Field("cloth", 1, "scalar", "N/m", "always", "k_f"),
-    "friction_damping": Field("cloth", 1, "scalar", "N s/m", "always", "d_f"),
+    "spacing": Field("gap", 1, "scalar", "m", "always", "L; and half the widths of a node's yarns"),
+    "radius": Field("half", 1, "scalar", "m", "always", "R, half the width and half the thickness; and 1 + crimp"),
+    "lengthening": Field("yarn", 1, "scalar", "", "general", "1 + crimp: length over the distance that it covers"),
+    "shear": Field("cloth crossing", 1, "scalar", "Pa", "always", "shear modulus S"),
+    "friction": Field("cloth crossing", 1, "scalar", "", "always", "μ"),
+    "friction_stiffness": Field("cloth crossing", 1, "scalar", "N/m", "always", "k_f"),
+    "friction_damping": Field("cloth crossing", 1, "scalar", "N s/m", "always", "d_f"),
     "friction_sharpness": Field("cloth", 1, "scalar", "", "always", "p of the law's tanh"),
     "parallel_stiffness": Field("cloth", 1, "scalar", "N/m", "always", "k_c"),
-    "lock_angle": Field("cloth", 1, "scalar", "rad", "always", "φ_l = 2 arcsin(R/L)"),
+    "lock_angle": Field("corner", 1, "scalar", "rad", "always", "φ_l = 2 arcsin(R/L)"),
     "published_scaling": Field("count", 1, "int", "", "always", "1: friction with arguments in SI units, as published"),
 }
-"""What a scene says of its yarns and its cloth."""
+"""What a scene says of its yarns and its cloth. A plain cloth has one gap, half, corner and cloth crossing; a general
+one (``kernels/core/general.py``) four gaps of each node, three halves of each yarn, four corners of each crossing, and
+as many cloth crossings as nodes."""
 
 INPUTS: Group = {
     "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g"),
@@ -221,6 +225,13 @@ CONTACT_INPUTS: Group = {
 }
 """What a scene says of contact. What it does not have is not in the arrays at all."""
 
+CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
+    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
+    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
+    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
+    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
+}
+
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
     "increment": Field("node", 1, "vec3", "m/s", "always", "velocities whose momentum the right-hand side has"),
@@ -371,6 +382,7 @@ GROUPS: dict[str, Group] = {
     "Levels": LEVELS,
     "Contact": CONTACT,
     "ContactInputs": CONTACT_INPUTS,
+    "Crimp": CRIMP,
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,

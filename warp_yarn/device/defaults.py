@@ -45,8 +45,13 @@ def preconditioner(scene: Scene, step: float) -> str:
         step: h [s].
     """
     cloth = scene.cloth
-    stretch = step * cloth.stretch_stiffness.max() / cloth.spacing
-    holds = "friction" in scene.terms and cloth.friction_damping > HOLDING * stretch
+    if cloth.general:
+        yarn = cloth.topology.segment_yarn
+        stiffness = cloth.stretch_stiffness[cloth.material[yarn]] * (1.0 + cloth.yarn_crimp[yarn])
+        stretch = step * float((stiffness / cloth.segment_spacing).max())
+    else:
+        stretch = step * cloth.stretch_stiffness.max() / cloth.spacing
+    holds = "friction" in scene.terms and cloth.least_friction_damping > HOLDING * stretch
     stiffness = (stretch_rate(scene).max() * step) ** 2
     return "multilevel" if stiffness > (STIFF if holds or not scene.sliding else STIFF_SLIDING) else "incomplete"
 
@@ -73,6 +78,9 @@ def newton_tolerance(scene: Scene, precision: str, step: float) -> float:
 
 
 def stretch_rate(scene: Scene) -> np.ndarray:
-    """Compute √(k_s/(m L)) of every material, m the mass of a segment [1/s]."""
+    """Compute √(k_s/(m L)) of every material, in a general cloth of every segment, m the mass of a segment [1/s]."""
     cloth = scene.cloth
-    return np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns]) / cloth.spacing
+    speed = np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns])
+    if cloth.general:
+        return speed[cloth.material[cloth.topology.segment_yarn]] / cloth.segment_spacing
+    return speed / cloth.spacing

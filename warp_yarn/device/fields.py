@@ -48,6 +48,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
     holds = {
         "always": True,
         "sliding": variant.sliding,
+        "general": variant.general,
         "contact": any(term.needs_contact for term in terms),
         "friction": "friction" in names,
         "shear": "shear" in names or others,
@@ -60,8 +61,10 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "pins move": scene.pin_path is not None,
         "has forces": len(scene.force_nodes) > 0,
         "forces change": len(scene.force_nodes) > 0 and len(scene.force_path) > 1,
-        "obstacles": len(scene.obstacles) > 0,
-        "obstacles move": any(obstacle.path is not None for obstacle in scene.obstacles),
-        "self-contact": scene.self_contact,
+        "obstacles": len(scene.obstacles) > 0 and scene.has_barrier,
+        "obstacles move": scene.has_barrier and any(obstacle.path is not None for obstacle in scene.obstacles),
+        "self-contact": scene.self_contact and scene.has_barrier,
+        "crimp interchange": "crimp_interchange" in names,
+        "crimped contact": scene.contact_force == "crimped",
     }
     return {name for name, value in holds.items() if value}

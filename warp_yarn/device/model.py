@@ -13,7 +13,8 @@ import warp as wp
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, choice, integer, real
-from ..kernels import TERMS, Term, Variant, build
+from ..kernels import TERMS, Term, Variant, build, own
+from ..kernels.core.general import NUMBERS
 from . import defaults
 from .arrays import Arrays
 from .contact import Contact
@@ -21,6 +22,7 @@ from .declarations import INPUTS
 from .declared import arguments
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
+from .impact_zones import ImpactZones
 from .inputs import Inputs
 from .threads import SOLVED, Threads
 
@@ -43,7 +45,8 @@ class Model:
         arrays: by the names that kernels use.
         kernels: by name.
         inputs: those that change from step to step.
-        contact: what the cloth touches.
+        contact: what the cloth touches by a barrier.
+        zones: keep it apart otherwise; None: there are none.
         energy: the watch over it.
         threads: processor cores that share a linear solve.
         has_hard_pins: whether pins are exact.
@@ -75,16 +78,13 @@ class Model:
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
         self.tolerance = real("tolerance", tolerance, above=0.0)
-        if newton_tolerance is None and exact:
-            newton_tolerance = defaults.EXACT
-        if newton_tolerance is not None:
-            newton_tolerance = real("newton_tolerance", newton_tolerance, above=0.0)
-        self._newton_tolerance = newton_tolerance
+        given = defaults.EXACT if newton_tolerance is None and exact else newton_tolerance
+        self._newton_tolerance = given if given is None else real("newton_tolerance", given, above=0.0)
         if max_iterations is None:
             max_iterations = defaults.max_iterations(scene)
         self.max_iterations = integer("max_iterations", max_iterations, least=1)
         self.device = _checked_device(device)
-        variant = Variant(PRECISIONS[precision], scene.sliding, differentiable)
+        variant = Variant(PRECISIONS[precision], scene.sliding, differentiable, general=scene.cloth.general)
         self.kernels = _kernels(scene, variant)
         self.arrays = Arrays(scene, variant, self.device)
         _check_inputs(self)
@@ -92,6 +92,7 @@ class Model:
         self.set_times(self.step_size, self.step_size, self.step_size)
         self.inputs = Inputs(self)
         self.contact = Contact(self)
+        self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
             self.arrays.add_levels()
@@ -160,14 +161,13 @@ class Model:
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
-            self.launch_term(term, matrix=filled, add_contact_load=int(a.contact), **arrays)
+            self.launch_term(term, matrix=filled, add_contact_load=_presses(self, term), **arrays)
         self.launch("right_hand_side", "nodes", **replaced)
 
     def _find_normals(self) -> None:
         """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
         if self.arrays.contact:
-            self.arrays.zero("contact_load")
-            self.launch("contact_normal", "crossings")
+            _find_crossings(self)
         self.contact.find()
 
     def add_contact_load(self) -> None:
@@ -175,7 +175,7 @@ class Model:
         a = self.arrays
         self._find_normals()
         for term in a.terms:
-            if a.contact and term.presses:
+            if term.presses and _presses(self, term):
                 # the forces go where the solver works
                 unused = {"force": a["q_x"], "euler_force": a["q_s"]}
                 self.launch_term(term, matrix=0, add_contact_load=1, **unused)
@@ -234,6 +234,24 @@ class Model:
         self.launch("record", "nodes")
 
 
+def _find_crossings(model: Model) -> None:
+    """Fills the normals of crossings, and sets their loads to 0, or to those at crimped positions."""
+    model.arrays.zero("contact_load")
+    model.launch("contact_normal", "crossings")
+    if model.scene.contact_force == "crimped":
+        for name in ("stretch", "bending"):
+            if name in model.scene.terms:
+                model.launch(f"crimped_{name}_load", "bends")
+
+
+def _presses(model: Model, term: Term) -> int:
+    """Tells whether a term is to add to the contact loads: stretch and bending are not where these are taken at crimped
+    positions, nor is bending beside crimp interchange, which has what bends the yarns there."""
+    crimped = model.scene.contact_force == "crimped" and term.name in ("stretch", "bending")
+    interchanged = model.scene.crimp_interchange and term.name == "bending"
+    return int(model.arrays.contact and not crimped and not interchanged)
+
+
 def _checked_device(device: Any) -> Any:
     """Finds a device of Warp."""
     try:
@@ -251,12 +269,16 @@ def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
 
 
 def _check_inputs(model: Model) -> None:
-    """Refuses a term that takes what acts on other cloths, and not on this one."""
+    """Refuses a term that takes what acts on other cloths, and not on this one, or one number of what has several."""
     for term in model.arrays.terms:
         for name in (term.name, f"{term.name}_energy"):
             taken = arguments(model.kernels[name]) if name in model.kernels else set()
             for lacking in sorted(taken & set(INPUTS) - set(model.arrays)):
                 raise InputError(f"scene.terms has {term.name!r}, which takes {lacking!r}: the scene has none")
+            for read in sorted(taken & NUMBERS) if model.arrays.variant.general and not own(term) else ():
+                raise InputError(
+                    f"scene.terms has {term.name!r}, which reads one {read!r} of the cloth: this one has several"
+                )
 
 
 def _factorize_levels(model: Model) -> None:

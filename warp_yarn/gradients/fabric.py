@@ -60,7 +60,9 @@ class Fabric(torch.nn.Module):
             return torch.tensor(scene.registered_value(name))
         if name in self.rollout.of_yarns:
             return torch.tensor([getattr(yarn, name) for yarn in scene.cloth.yarns], dtype=torch.float64)
-        return self.rollout.defaults[name.removeprefix("yarn_")]
+        if name in self.rollout.of_crossings:
+            return torch.tensor(getattr(scene.cloth, name), dtype=torch.float64)
+        return self.rollout.defaults[name.removeprefix("yarn_").removeprefix("node_")]
 
     def value(self, name: str) -> torch.Tensor:
         """Computes a parameter in its physical unit; differentiable."""

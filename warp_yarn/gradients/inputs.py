@@ -16,7 +16,7 @@ from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
 
 _OWN = [parameter for term in TERMS.values() if own(term) for parameter in term.parameters]
-NUMBERS = tuple(p.name for p in _OWN if p.of == "scene" and p.size == 1)
+NUMBERS = tuple(p.name for p in _OWN if p.of in ("scene", "crossing") and p.size == 1)
 VECTORS = tuple(p.name for p in _OWN if p.size == 3)
 """Names of inputs that are no yarn's, beside those of registered terms."""
 ARRAY_OF_PATH = {"pin_path": "pin_target", "forces": "applied_force"}
@@ -32,8 +32,10 @@ class Inputs:
     Attributes:
         dtype, device: of the tensors.
         of_yarns: names of the parameters that yarns have.
-        defaults: the scene's own value of everything, the yarns' parameters by yarn.
-        shapes: name and shape of everything that a call takes, the yarns' parameters by material too.
+        of_crossings: names of those that crossings have, in a general cloth.
+        defaults: the scene's own value of everything, the yarns' parameters by yarn, those of crossings by node.
+        shapes: name and shape of everything that a call takes, the yarns' parameters by material too, and those of
+            crossings as the cloth has them.
     """
 
     def __init__(self, simulator: Simulator):
@@ -43,16 +45,22 @@ class Inputs:
         arrays = simulator.arrays
         self._parameters = {name: p for name, p in parameters().items() if arrays.get(name) is not None}
         self.of_yarns = tuple(name for name, p in self._parameters.items() if p.of == "yarn")
+        crossings = (name for name, p in self._parameters.items() if p.of == "crossing" and self.cloth.general)
+        self.of_crossings = tuple(crossings)
         self.defaults = self._scene_values(simulator)
         self.shapes = {name: tuple(value.shape) for name, value in self.defaults.items()}
         for name in self.of_yarns:
             self.shapes[f"yarn_{name}"] = self.shapes[name]
             self.shapes[name] = (len(self.cloth.yarns),)
+        for name in self.of_crossings:
+            self.shapes[f"node_{name}"] = self.shapes[name]
+            self.shapes[name] = np.shape(getattr(self.cloth, name))
 
     def _scene_values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Reads the scene's own values from the device."""
         arrays = simulator.arrays
-        shapes = {name: (-1,) if p.of == "yarn" or p.size == 3 else () for name, p in self._parameters.items()}
+        several = (*self.of_yarns, *self.of_crossings)
+        shapes = {name: (-1,) if name in several or p.size == 3 else () for name, p in self._parameters.items()}
         values = {name: arrays[name].numpy().reshape(shape) for name, shape in shapes.items()}
         for name, array in ARRAY_OF_PATH.items():
             if f"{array}_path" in arrays:
@@ -80,7 +88,7 @@ class Inputs:
             if getattr(state, name) is not None:
                 inputs[name] = getattr(state, name)
         values = {name: self.checked(name, value) for name, value in inputs.items()}
-        material = torch.as_tensor(self.cloth.material, device=self.device)
+        material = torch.tensor(self.cloth.material, device=self.device)
         for name in self.of_yarns:
             if name in values and f"yarn_{name}" in values:
                 raise InputError(f"{name} and yarn_{name} are both given, must be one of them")
@@ -88,6 +96,13 @@ class Inputs:
                 values[name] = values[name][material]
             elif f"yarn_{name}" in values:
                 values[name] = values.pop(f"yarn_{name}")
+        for name in self.of_crossings:
+            if name in values and f"node_{name}" in values:
+                raise InputError(f"{name} and node_{name} are both given, must be one of them")
+            if name in values:
+                values[name] = values[name].reshape(-1)[torch.as_tensor(self.cloth.entries(name), device=self.device)]
+            elif f"node_{name}" in values:
+                values[name] = values.pop(f"node_{name}")
         if "euler_velocity" in values:
             crossing = torch.as_tensor(self.cloth.topology.is_crossing != 0, device=self.device)
             values["euler_velocity"] = values["euler_velocity"] * crossing[:, None]
@@ -127,7 +142,7 @@ class Inputs:
 def obstacle_shapes(simulator: Simulator) -> dict[str, tuple[int, ...]]:
     """Lists the inputs that say where obstacles are and what they are like, with their shapes."""
     count = len(simulator.scene.obstacles)
-    if not count:
+    if not simulator.model.contact.obstacles:
         return {}
     shapes: dict[str, tuple[int, ...]] = {"obstacle_size": (count, 3), "obstacle_friction": (count,)}
     rest = (-1, count) if simulator.model.contact.obstacles_move else (count,)
@@ -145,7 +160,7 @@ def allowed_range(name: str) -> dict[str, float]:
     """Says what ``number`` is to check of an input."""
     if name in ("obstacle_size", "obstacle_friction"):
         return {"least": 0.0}
-    parameter = parameters().get(name.removeprefix("yarn_"))
+    parameter = parameters().get(name.removeprefix("yarn_").removeprefix("node_"))
     return {} if parameter is None else parameter.range
 
 

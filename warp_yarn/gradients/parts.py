@@ -30,12 +30,14 @@ class Part:
         left: part of the step that was left when it began, itself included.
         method: the integrator that made it.
         start: what moves of the state that it started from, flat, by names.
+        projected: what impact zones did at its end; None: nothing.
     """
 
     size: float
     left: float
     method: Any
     start: Mapping[str, torch.Tensor]
+    projected: Any = None
 
 
 @dataclasses.dataclass
@@ -52,6 +54,8 @@ class SplitStep:
             frames = flat(simulator.arrays[f"frame_{name}"])
             frames[: len(start)].copy_(start)
             frames[len(start) : 2 * len(start)].copy_(end[name])
+        if simulator.model.zones is not None:
+            simulator.model.zones.put(1, [self.parts[k].projected])
 
 
 class PartsRecorder:
@@ -85,9 +89,11 @@ class PartsRecorder:
             moving = [name for name in FIELDS if self.simulator.moves(name)]
             start, end = ({name: flat(arrays[of + name]).clone() for name in moving} for of in ("kept_", ""))
             step = int(arrays["counters"].numpy()[1]) - self.steps_done
+            zones = self.simulator.model.zones
+            projected = None if zones is None else zones.made.get(int(arrays["counters"].numpy()[0]))
         if left == 1.0:  # whatever was begun before, and given up
             self.steps[step] = SplitStep([], end)
-        self.steps[step].parts.append(Part(size, left, method, start))
+        self.steps[step].parts.append(Part(size, left, method, start, projected))
         self.steps[step].end = end
 
 

@@ -98,7 +98,7 @@ class Rollout:
         self._options = {**options, "device": str(self.simulator.model.device)}
         self._inputs = Inputs(self.simulator)
         self.dtype, self.device = self._inputs.dtype, self._inputs.device
-        self.of_yarns = self._inputs.of_yarns
+        self.of_yarns, self.of_crossings = self._inputs.of_yarns, self._inputs.of_crossings
         self._run = DeviceRun(self.simulator, self._inputs, self.steps, self.frames, self.checkpoint_every)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -120,6 +120,9 @@ class Rollout:
         """Everything that a call takes, and that a gradient can be asked for: name and shape.
 
         density, stretch and bend are of each material; with ``yarn_`` before them, of each yarn, the warp yarns first.
+        shear, friction, friction_stiffness and friction_damping have the cloth's own shapes: a number, one of each pair
+        of materials, or one of each node; where any number of the cloth is not the same everywhere, with ``node_``
+        before them, of each node, of which those on the border mean nothing.
         pin_path and forces have the shapes that the scene gave them. Nodes on the border have no Eulerian coordinate:
         their rows of euler_velocity are taken for 0.
         """
@@ -172,7 +175,7 @@ class _Forward(torch.autograd.Function):
         values = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
         frames, kept = run.forward(values, steps_done, differentiable=True)
         ctx.run, ctx.names, ctx.steps_done = run, names, steps_done
-        ctx.kept_names, ctx.split = tuple(kept.states), kept.split
+        ctx.kept_names, ctx.split, ctx.projected = tuple(kept.states), kept.split, kept.projected
         ctx.save_for_backward(*tensors, *kept.states.values())
         ctx.set_materialize_grads(False)
         return tuple(frames[name] for name in FIELDS)
@@ -182,7 +185,7 @@ class _Forward(torch.autograd.Function):
         """Asks for the gradients of those inputs that need one."""
         ctx.wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[3:], strict=True) if needed]
         saved, inputs = ctx.saved_tensors, len(ctx.names)  # once: torch.utils.checkpoint gives them no second time
-        kept = Kept(dict(zip(ctx.kept_names, saved[inputs:], strict=True)), ctx.split)
+        kept = Kept(dict(zip(ctx.kept_names, saved[inputs:], strict=True)), ctx.split, ctx.projected)
         found = _Backward.apply(ctx, kept, *losses, *saved[:inputs])
         gradients = dict(zip(ctx.wanted, found, strict=True))
         return (None, None, None, *(gradients.get(name) for name in ctx.names))

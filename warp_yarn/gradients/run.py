@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,6 +29,8 @@ class Kept(NamedTuple):
     """What moves of the states that ``Checkpoints`` keeps."""
     split: dict[int, SplitStep]
     """Steps that were made in parts, by their number in the run."""
+    projected: list[Any]
+    """What impact zones did at the end of each step; empty where there are none."""
 
 
 class DeviceRun:
@@ -70,6 +72,7 @@ class DeviceRun:
         kept = self.checkpoints.room() if differentiable else {}
         result = self.checkpoints.room(len(self.frames))
         recorder, done = PartsRecorder(simulator, steps_done), 0
+        zones, projected = simulator.model.zones, []
         while done < self.steps:
             asked = min(simulator.chunk, self.steps - done)
             with recorder.recording() if differentiable else contextlib.nullcontext():
@@ -79,6 +82,8 @@ class DeviceRun:
             inside = np.flatnonzero((self.frames >= done + (done > 0)) & (self.frames <= done + made))
             with ALONE:
                 self.checkpoints.keep(kept, done, made)
+                if zones is not None and differentiable:
+                    projected += [zones.made.get(k + 1) for k in range(made)]
                 if len(inside):
                     self.checkpoints.store(result, self.frames[inside] - done, int(inside[0]))
             done += made
@@ -87,7 +92,7 @@ class DeviceRun:
             name: result[name] if name in result else given[name].expand(len(self.frames), -1, -1).clone()
             for name in FIELDS
         }
-        return frames, Kept(kept, recorder.steps)
+        return frames, Kept(kept, recorder.steps, projected)
 
     def backward(
         self,
@@ -118,6 +123,8 @@ class DeviceRun:
                 before = kept.split.get(first)
                 start = None if before is None or first % self.simulator.chunk == 0 else before.end
                 self.checkpoints.bring_back(kept.states, first, steps, steps_done, start)
+                if self.simulator.model.zones is not None:
+                    self.simulator.model.zones.put(1, kept.projected[first : first + steps])
                 self._set_losses(losses, first, steps)
                 adjoint.backward_chunk(first, steps, steps_done)
                 continue

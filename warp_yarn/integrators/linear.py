@@ -15,7 +15,8 @@ class LinearlyImplicitEuler:
     """(M + h² H + h D) q̇⁺ = h F + (M + h D) q̇,   q⁺ = q + h q̇⁺: one linear solve a step.
 
     Order 1. Damps stiff modes as implicit Euler does, H being the positive semi-definite part of the stiffness; what is
-    not in H and D (wind by position, inertia, what friction owes to the contact force) is explicit.
+    not in H and D (wind by position, inertia, what friction owes to the contact force) is explicit. Impact zones come
+    after it (``device/impact_zones.py``).
     """
 
     name = "linear"
@@ -33,10 +34,20 @@ class LinearlyImplicitEuler:
         self.model.set_times(step, remaining, step)
 
     def advance(self) -> None:
-        """Makes a step, and records it."""
-        self._graphs.run("forward", self._step)
+        """Makes a step, and records it. Impact zones are the host's, between two graphs."""
+        if self.model.zones is None:
+            self._graphs.run("forward", self._step)
+            return
+        self.model.zones.begin()
+        self._graphs.run("solve", self._solve_step)
+        self.model.zones.apply()
+        self._graphs.run("end", self.model.end_step)
 
     def _step(self) -> None:
+        self._solve_step()
+        self.model.end_step()
+
+    def _solve_step(self) -> None:
         model = self.model
         model.begin_step()
         model.inputs.load()
@@ -47,7 +58,6 @@ class LinearlyImplicitEuler:
         model.factorize()
         model.solve()
         model.launch("advance", "nodes")
-        model.end_step()
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -69,7 +79,8 @@ class LinearlyImplicitEuler:
         with self.anchor_tape:
             model.update_anchor("euler_next", "anchor_next")
         self._around = before, after
-        self._graphs.pop("backward", None)
+        for name in ("backward", "restore", "reverse"):
+            self._graphs.pop(name, None)
 
     def _record(self) -> None:
         self.model.assemble()
@@ -81,16 +92,29 @@ class LinearlyImplicitEuler:
         Before, the gradients of the state's arrays hold the adjoint of the step's end; after, that of its beginning,
         and those of parameters have gained the step's part.
         """
-        self._graphs.run("backward", self._backward_step)
+        if self.model.zones is None:
+            self._graphs.run("backward", self._backward_step)
+            return
+        self._graphs.run("restore", self._begin_backward)
+        self.model.zones.reverse()
+        self._graphs.run("reverse", self._end_backward)
+        self.model.zones.end_reverse()
 
     def _backward_step(self) -> None:
-        before, after = self._around
+        self._begin_backward()
+        self._end_backward()
+
+    def _begin_backward(self) -> None:
+        before, _after = self._around
         before()
+        self._restore()
+
+    def _end_backward(self) -> None:
+        _before, after = self._around
         self._reverse()
         after(0)
 
     def _reverse(self) -> None:
-        self._restore()
         self.model.assemble()
         self._reverse_anchors()
         self.model.launch("adjoint_right_hand_side", "nodes")

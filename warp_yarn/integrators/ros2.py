@@ -102,7 +102,6 @@ class ROS2(LinearlyImplicitEuler):
 
     def _reverse(self) -> None:
         model, a = self.model, self.model.arrays
-        self._restore()
         model.inputs.load(1)
         model.launch("restore_both_stages", "nodes")
         model.launch("enter_second_stage", "nodes", start=None, euler_start=None)

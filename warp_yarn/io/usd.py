@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError, integer, real
 from ..simulation.state import Trajectory
 from ..view.geometry import OBSTACLE_COLOR, Placed, checked, placed
-from ..view.yarns import Strands, Weaving, sections
+from ..view.yarns import Strands, Weaving
 from .files import atomic_write
 from .usd_prims import Curves, Shape, Surface, TubeMesh, bind, linear, material, vectors, write_obstacle, write_points
 
@@ -253,7 +253,7 @@ def origins(trajectory: Trajectory) -> np.ndarray:
     move them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
     position = trajectory.position
     low, high = position.min(axis=1), position.max(axis=1)
-    reach = COARSE * float(sections(trajectory.cloth).min()) / np.finfo(np.float32).epsneg
+    reach = COARSE * float(trajectory.cloth.halves.min()) / np.finfo(np.float32).epsneg
     middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
     for origin in (np.zeros(3), middle):
         if max(np.abs(low - origin).max(), np.abs(high - origin).max()) <= reach:

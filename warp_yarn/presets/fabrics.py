@@ -11,12 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 from ..description.cloth import Cloth, Yarn
-from ..description.weave import WEAVES
-from ..errors import choice
+from ..description.weave import Weave, woven
 from . import paper
 
 
-def handkerchief(rows: int = 17, columns: int = 17, weave: str = "plain", **options: Any) -> Cloth:
+def handkerchief(rows: int = 17, columns: int = 17, weave: str | Weave = "plain", **options: Any) -> Cloth:
     """Make a soft, open cloth of 100 g/m².
 
     L 1 mm, R L/3; yarns of 50 tex (5e-5 kg/m), k_s 3 N, k_b 2e-8 N m²; S 1000 Pa.
@@ -26,7 +25,8 @@ def handkerchief(rows: int = 17, columns: int = 17, weave: str = "plain", **opti
 
     Args:
         rows, columns: number of warp and of weft yarns, at least 3.
-        weave: "plain", "twill" or "satin".
+        weave: "plain", "twill" or "satin", words of ``Weave.from_notation`` such as "3/1 twill Z", or a Weave of as
+            many yarns.
         options: of the Cloth, to change it: ``pose``, ``friction``, ...; Y and B stay those of R = L/3.
     """
     return _uniform(
@@ -34,7 +34,7 @@ def handkerchief(rows: int = 17, columns: int = 17, weave: str = "plain", **opti
     )
 
 
-def cotton(rows: int = 17, columns: int = 17, weave: str = "plain", **options: Any) -> Cloth:
+def cotton(rows: int = 17, columns: int = 17, weave: str | Weave = "plain", **options: Any) -> Cloth:
     """Make a shirt's cotton of 92 g/m².
 
     L 1/2300 m (23 yarns/cm), R 0.08 mm; yarns of 20 tex (2e-5 kg/m), k_s 20 N, k_b 5e-9 N m²; S 2.5e5 Pa.
@@ -45,7 +45,8 @@ def cotton(rows: int = 17, columns: int = 17, weave: str = "plain", **options: A
 
     Args:
         rows, columns: number of warp and of weft yarns, at least 3.
-        weave: "plain", "twill" or "satin".
+        weave: "plain", "twill" or "satin", words of ``Weave.from_notation`` such as "3/1 twill Z", or a Weave of as
+            many yarns.
         options: of the Cloth, to change it: ``pose``, ``friction``, ...; Y and B stay those of R = 0.08 mm.
     """
     return _uniform(
@@ -56,7 +57,7 @@ def cotton(rows: int = 17, columns: int = 17, weave: str = "plain", **options: A
 def _uniform(
     rows: int,
     columns: int,
-    weave: str,
+    weave: str | Weave,
     *,
     spacing: float,
     radius: float,
@@ -69,7 +70,7 @@ def _uniform(
     """Make a cloth of one yarn, of a mass in tex (1e-6 kg/m), a tension k_s [N] and a bending stiffness k_b [N m²]."""
     section = math.pi * radius**2
     yarn = Yarn(density=1e-6 * tex, stretch=k_s / section, bend=k_b / section)
-    draft = WEAVES[choice("weave", weave, WEAVES)](rows=rows, columns=columns)
+    draft = woven(weave, rows=rows, columns=columns)
     return Cloth(draft, **{"yarns": [yarn], "spacing": spacing, "radius": radius, "shear": shear, **options})
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from ..description.cloth import Cloth, Yarn
 from ..description.scene import Scene, Wind
-from ..description.weave import WEAVES
-from ..errors import InputError, choice
+from ..description.weave import Weave, woven
+from ..errors import InputError
 from ..view.geometry import PALETTE
 
 YARNS = {
@@ -35,12 +35,13 @@ WIND = (0.0, 5.0, 0.0)
 
 
 def cloth(
-    weave: str = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
+    weave: str | Weave = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
 ) -> Cloth:
     """Makes a cloth of two of the paper's yarns, upright.
 
     Args:
-        weave: "plain", "twill" or "satin".
+        weave: "plain", "twill" or "satin", words of ``Weave.from_notation`` such as "3/1 twill Z", or a Weave of as
+            many yarns.
         rows, columns: number of warp and of weft yarns, at least 3.
         yarns: the numbers of two different yarns; even yarns of the cloth are of the first, odd ones of the second.
         options: of the Cloth, to change it: ``pose``, ``friction``, ...
@@ -49,8 +50,7 @@ def cloth(
     if pair not in SHEAR:
         pairs = ", ".join(f"{a} {b}" for a, b in SHEAR)
         raise InputError(f"yarns = {' '.join(map(str, yarns))}, must be two that the paper combines: {pairs}")
-    make = WEAVES[choice("weave", weave, WEAVES)]
-    draft = make(rows=rows, columns=columns)
+    draft = woven(weave, rows=rows, columns=columns)
     numbers = {"yarns": [YARNS[k] for k in yarns], "shear": SHEAR[pair], "friction_damping": FRICTION_DAMPING}
     return Cloth(draft, **{**numbers, **options})
 
@@ -65,7 +65,7 @@ def hung(cloth: Cloth, **options: Any) -> Scene:
 
 
 def hung_cloth(
-    weave: str = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
+    weave: str | Weave = "plain", rows: int = 17, columns: int = 17, yarns: Sequence[int] = (1, 2), **options: Any
 ) -> Scene:
     """Makes ``hung(cloth(...), **options)``, all in one call."""
     return hung(cloth(weave, rows, columns, yarns), **options)

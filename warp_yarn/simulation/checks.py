@@ -12,6 +12,7 @@ import numpy as np
 from ..description.scene import Scene
 from ..errors import InputError, integer, real
 from ..integrators import INTEGRATORS
+from ..integrators.linear import LinearlyImplicitEuler
 from ..integrators.stage import StageMethod
 from .state import State
 
@@ -54,12 +55,20 @@ def checked_state(state: Any, scene: Scene) -> State:
 
 
 def check_contact(scene: Scene, integrator: str) -> None:
-    """Refuses contact with a method whose steps end elsewhere than a stage, of which none penetrates.
+    """Refuses contact with a method whose steps end elsewhere than a stage, of which none penetrates; and impact zones
+    with another one than that of eq. 2.
 
     Raises:
         InputError: such a method.
     """
     if not isinstance(scene, Scene) or not (scene.obstacles or scene.self_contact):
+        return
+    if scene.has_impact_zones:
+        if integrator != LinearlyImplicitEuler.name:
+            raise InputError(
+                f"integrator = {integrator!r} with impact zones, which come after a step of eq. 2: must be "
+                f"{LinearlyImplicitEuler.name!r}, or contact.method 'barrier'"
+            )
         return
 
     def ends_with_a_stage(method: type) -> bool:
@@ -68,7 +77,8 @@ def check_contact(scene: Scene, integrator: str) -> None:
     if not ends_with_a_stage(INTEGRATORS[integrator]):
         able = ", ".join(repr(name) for name, method in INTEGRATORS.items() if ends_with_a_stage(method))
         raise InputError(
-            f"integrator = {integrator!r} with contact: a step may end inside something; must be one of {able}"
+            f"integrator = {integrator!r} with contact: a step may end inside something; must be one of {able}, or "
+            "contact.method 'impact-zones' with 'linear'"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..device.impact_zones import MOST_ROUNDS
 from ..device.model import Model
 from ..errors import SimulationError
 from ..kernels.core import status
@@ -68,6 +69,7 @@ class Failure:
             status.OVERLAPPING: f"it is pressed into something that leaves it no way out{near}",
             status.CROWDED: "more of it comes together than there is room for",
             status.IMPACT: "something strikes it",
+            status.UNRESOLVED: f"impacts are left after {MOST_ROUNDS} rounds of impact zones",
             status.INACCURATE: f"its error stays above step_error = {step_error}: allow more",
         }[self.code]
         return SimulationError(

@@ -78,7 +78,13 @@ class Inspection:
 
     @alone
     def contacts(self, state: State | None = None) -> Contacts:
-        """Finds where nodes touch obstacles and each other (None: in the present state)."""
+        """Finds where nodes touch obstacles and each other (None: in the present state).
+
+        Raises:
+            InputError: impact zones keep them apart, which have no forces.
+        """
+        if self.model.zones is not None:
+            raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
         contact, found = self.model.contact, []
         with _Visit(self.stepper, state):
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
@@ -105,6 +111,8 @@ class Inspection:
         Raises:
             InputError: the two places that are nearest, and how near.
         """
+        if self.model.zones is not None:
+            self.model.zones.check_clear(None if state is None else state.position)
         contact = self.model.contact
         if not contact.on:
             return

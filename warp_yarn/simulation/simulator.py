@@ -21,12 +21,15 @@ from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
 from .diagnosis import Failure
 from .frames import Frames
-from .inspection import Inspection
+from .placing import Placing
 from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
 
-BESIDE_TERMS = ("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path")
+BESIDE_TERMS = (
+    *("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path"),
+    *("obstacle_position", "obstacle_rotation"),
+)
 """Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
 
 
@@ -39,7 +42,7 @@ def _of_stepper(name: str) -> Any:
     )
 
 
-class Simulator(Inspection):
+class Simulator(Placing):
     """Simulates a scene.
 
     Threads may share one, and simulators may run in several threads: each call is as if it were alone. After an
@@ -72,8 +75,8 @@ class Simulator(Inspection):
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
             are free: a RuntimeWarning says where there are not so many. They pay on large cloths
             (``benchmarks/bandwidth.py``).
-        step_error: how far any node may be put wrong in a part of a step, in spacings of the yarns; each step is then
-            made in as many parts as that takes, and ``step`` is the time from frame to frame. For "sdirk2", whose
+        step_error: how far any node may be put wrong in a part of a step, in the least spacing of yarns; each step is
+            then made in as many parts as that takes, and ``step`` is the time from frame to frame. For "sdirk2", whose
             stages tell its error. None: steps are made at once.
         energy_watch: whether a step that gains energy from nowhere is made again, and ends the run where that does not
             help (``docs/solver.md``). False is for who wants a method as it is, such as the paper's eq. 2.
@@ -266,7 +269,7 @@ def _made(
     if step_error is not None:
         at_once.estimate_errors()
     fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](model)
-    substepping = Substepping(model, at_once, step_error and step_error * scene.cloth.spacing, fallback)
+    substepping = Substepping(model, at_once, step_error and step_error * scene.cloth.shortest_spacing, fallback)
     frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes))
     # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
     frames.upload(frames.rest())

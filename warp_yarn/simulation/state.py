@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from ..description.cloth import CLOTH_NUMBERS, Cloth, Yarn
+from ..description.cloth import CLOTH_NUMBERS, Cloth
 from ..description.cloths import Cloths
 from ..description.obstacles import Box, Capsule, Contact, Cylinder, Obstacle, Plane, Sphere, TriangleMesh
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
+from ..description.yarn import SIZES, Yarn
 from ..errors import InputError, choice, finite_array, integer, real
 from ..io.files import atomic_write
 
-FORMAT = 3
-"""Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth."""
+FORMAT = 4
+"""Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth; 3 had
+single numbers of cloths, no crimp and no sizes of yarns."""
 
 SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
@@ -197,13 +199,19 @@ def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
         return {"cloths": len(parts)} | {
             f"cloth_{k}_{name}": parts[k][name] for k in range(len(parts)) for name in parts[k]
         }
-    given = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
-    if cloth._arguments["friction_damping"] is None:
+    given = {name: cloth._arguments[name] for name in CLOTH_NUMBERS}
+    if given["friction_damping"] is None:
         given["friction_damping"] = np.nan  # of its own mass, also where others are beside it
+    for name in ("spacing", "crimp"):
+        value = cloth._arguments[name]
+        warp, weft = value if isinstance(value, tuple) else (value, None)
+        given |= {name: warp} if weft is None else {name: warp, f"{name}_weft": weft}
+    sizes = [[np.nan if size is None else size for size in yarn.sizes] for yarn in cloth.yarns]
     return {
         "draft": cloth.weave.draft,
         "weave": cloth.weave.name,
         "yarns": np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns]),
+        "sizes": np.array(sizes),
         "colors": np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns]),
         "warp": cloth.warp,
         "weft": cloth.weft,
@@ -225,8 +233,20 @@ def _unpacked_cloth(data: Any, of: str) -> Cloth:
         Yarn(density=d, stretch=s, bend=b, color=None if np.isnan(color).any() else tuple(color.tolist()))
         for (d, s, b), color in zip(data[f"{of}yarns"].tolist(), data[f"{of}colors"], strict=True)
     ]
-    numbers = {name: data[f"{of}{name}"].item() for name in CLOTH_NUMBERS}
-    if np.isnan(numbers["friction_damping"]):
+    if f"{of}sizes" in data:
+        sizes = [dict(zip(SIZES, each, strict=True)) for each in data[f"{of}sizes"].tolist()]
+        sizes = [{name: size for name, size in each.items() if not np.isnan(size)} for each in sizes]
+        yarns = [dataclasses.replace(yarn, **each) for yarn, each in zip(yarns, sizes, strict=True)]
+
+    def value(name: str) -> Any:
+        array = data[f"{of}{name}"]
+        return array if array.ndim else array.item()
+
+    numbers = {name: value(name) for name in (*CLOTH_NUMBERS, "crimp") if f"{of}{name}" in data}
+    for name in ("spacing", "crimp"):
+        if f"{of}{name}_weft" in data:
+            numbers[name] = numbers[name], value(f"{name}_weft")
+    if np.isnan(numbers["friction_damping"]).any():
         numbers["friction_damping"] = None
     return Cloth(
         Weave(data[f"{of}draft"], str(data[f"{of}weave"])),
@@ -255,6 +275,9 @@ def _packed(scene: Scene) -> dict[str, Any]:
         "parameters": list(scene.parameters) or None,
         **{f"parameter_{name}": values for name, values in scene.parameters.items()},
         "self_contact": scene.self_contact,
+        # left out where they are what recordings of before have
+        "pressing": None if scene.contact_force == "published" else scene.contact_force,
+        "crimp_interchange": scene.crimp_interchange or None,
         # None is a value of its own there, not always the default
         **{f"contact_{name}": np.nan if value is None else value for name, value in scene.contact._arguments.items()},
         "obstacles": np.array([obstacle.shape for obstacle in scene.obstacles], dtype=str),
@@ -286,6 +309,8 @@ def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         obstacles=_unpacked_obstacles(data),
         self_contact="scene_self_contact" in data and value("self_contact").item(),
         contact=Contact(**_arguments(data, "contact")),
+        contact_force=value("pressing").item() if "scene_pressing" in data else "published",
+        crimp_interchange="scene_crimp_interchange" in data,
     )
 
 

@@ -43,6 +43,8 @@ class Strands:
     """[strands]: index of the yarn, warp yarns first; of several that selvedges join, the first."""
     half: np.ndarray
     """[strands, 2]: half the width and half the height of the section [m]."""
+    crimp: np.ndarray
+    """[strands]: how much longer than the distance that it covers at rest the yarn is, over that distance."""
     counts: np.ndarray
     """[strands]: points of each."""
     places: np.ndarray
@@ -97,7 +99,7 @@ class Weaving:
             self._yarn[d, a] = self._yarn[d, b] = topology.segment_yarn[along == d]
         self.crossed = np.logical_and(*(self._yarn >= 0))
         self._side = np.where(_flipped(cloth), -1.0, 1.0)
-        self._half = sections(cloth)
+        self._half = cloth.halves
         self._tips: list[tuple[int, int, float]] = []
         self._turns: list[tuple[int, int]] = []
         self.strands = self._strands(selvedge)
@@ -131,7 +133,7 @@ class Weaving:
     # -- what runs where ---------------------------------------------------------------------------------------------
 
     def _strands(self, selvedge: bool) -> list[Strands]:
-        topology, euler = self.cloth.topology, self.cloth.euler
+        topology = self.cloth.topology
         order = np.argsort(topology.segment_yarn, kind="stable")
         segments, yarns = topology.segment_nodes[order], topology.segment_yarn[order]
         breaks = (np.diff(yarns, prepend=-1) != 0) | (segments[:, 0] != np.roll(segments[:, 1], 1))
@@ -139,7 +141,7 @@ class Weaving:
         runs = [np.append(run[:, 0], run[-1, 1]) for run in np.split(segments, starts[1:])]
         pieces: dict[int, list[Piece]] = {}
         for yarn, nodes in zip(yarns[starts].tolist(), runs, strict=True):
-            pieces.setdefault(int(self.cloth.material[yarn]), []).append(self._piece(yarn, nodes, euler))
+            pieces.setdefault(int(self.cloth.material[yarn]), []).append(self._piece(yarn, nodes))
         several, result = len(pieces) > 1, []
         for k in sorted(pieces):
             lift = ((-1.0) ** k) if several else 0.0
@@ -149,10 +151,10 @@ class Weaving:
             joined = {name: np.concatenate([each[name] for each in strands]) for name in names}
             yarn = np.array([each["yarn"] for each in strands])
             counts = np.array([len(each["places"]) for each in strands])
-            result.append(Strands(k, color, yarn, self._half[yarn], counts, **joined))
+            result.append(Strands(k, color, yarn, self._half[yarn], self.cloth.yarn_crimp[yarn], counts, **joined))
         return result
 
-    def _piece(self, yarn: int, nodes: np.ndarray, euler: np.ndarray) -> Piece:
+    def _piece(self, yarn: int, nodes: np.ndarray) -> Piece:
         """Describes one yarn, with the free ends that it has where another one crosses its last node."""
         d = int(self.cloth.topology.yarn_direction[yarn])
         crossed, other = self.crossed[nodes], self._yarn[1 - d, nodes]
@@ -160,7 +162,7 @@ class Weaving:
         piece = {
             "places": nodes,
             "height": side * self._half[yarn, 1],
-            "arc": euler[nodes, d],
+            "arc": self.cloth.euler[nodes, d],
             "arc_of": np.stack([nodes, np.full_like(nodes, d)], axis=1),
             "arc_sign": np.ones(len(nodes)),
             "across": np.where(crossed[:, None], np.c_[self._half[other], -side * self._half[other, 1]], 0.0),
@@ -168,12 +170,13 @@ class Weaving:
         for end in (0, -1):
             if crossed[end]:
                 last, before = nodes[end], nodes[1 if end == 0 else -2]
-                gap = abs(euler[last, d] - euler[before, d])
+                gap = abs(self.cloth.rest_grid[last, d] - self.cloth.rest_grid[before, d])
                 reach = float(self._half[other[end], 0] + FREE_END * gap)
                 tip = {name: value[[end]] for name, value in piece.items()}
                 tip["places"] = np.array([self.cloth.topology.nodes + len(self._tips)])
                 tip["height"], tip["across"] = np.zeros(1), np.zeros((1, 3))
-                tip["arc"] = tip["arc"] + (reach if end else -reach)
+                length = reach * (1.0 + self.cloth.yarn_crimp[yarn])
+                tip["arc"] = tip["arc"] + (length if end else -length)
                 self._tips.append((int(last), int(before), reach))
                 parts = (piece, tip) if end else (tip, piece)
                 piece = {name: np.concatenate([part[name] for part in parts]) for name in piece}
@@ -200,7 +203,7 @@ class Weaving:
             first, second = (int(p["places"][end]) - topology.nodes for p, end in ((joined, -1), (following, 0)))
             ends = [self._tips[k][0] for k in (first, second)]
             # half of a half circle from tip to tip
-            quarter = 0.25 * np.pi * float(np.abs(np.diff(self.cloth.euler[ends, 0]))[0])
+            quarter = 0.25 * np.pi * float(np.abs(np.diff(self.cloth.rest_grid[ends, 0]))[0])
             turn = {name: value[-1:] for name, value in joined.items() if name != "yarn"}
             turn["places"] = np.array([topology.nodes + len(self._tips) + len(self._turns)])
             turn["height"] = np.full(1, lift * self._half[piece["yarn"], 1])
@@ -259,7 +262,7 @@ class Tubes:
         low, high = strands.height[segment], strands.height[segment + 1]
         height = low + smooth * (high - low)
         half = np.repeat(strands.half, counts, axis=0)
-        gap = np.abs(strands.arc[segment + 1] - strands.arc[segment])
+        gap = np.abs(strands.arc[segment + 1] - strands.arc[segment]) / (1.0 + np.repeat(strands.crimp, counts))
         half[:, 1] = squeezed(share, gap, height, half[:, 1], strands.across[segment], strands.across[segment + 1])
         places, points = strands.places[near], np.stack([segment, segment + 1], axis=1)
         return cls(strands, counts, places, weights, slopes, share, height, steep * (high - low), half, points)
@@ -351,14 +354,6 @@ def squeezed(
         distance = np.sqrt((x**2 + z**2).min(axis=1))
         room = np.where(crossed[:, 0] > 0.0, np.minimum(room, distance), room)
     return np.maximum(room, LEAST_HEIGHT * half)[inverse.ravel()]
-
-
-def sections(cloth: Cloth | Cloths) -> np.ndarray:
-    """Gives half the width and half the height of every yarn's section [yarns, 2] (m)."""
-    halves = getattr(cloth, "halves", None)  # of cloths whose yarns have a width and a thickness each
-    if halves is not None:
-        return np.asarray(halves)
-    return np.full((len(cloth.material), 2), cloth.radius)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,0 +1,80 @@
+"""Motions of cloths whose yarns straighten at each other's expense."""
+
+import numpy as np
+import pytest
+from checks import matrix
+
+import warp_yarn as wy
+
+
+def cotton(crimp: float | None = None, weave: str = "plain", size: int = 6) -> wy.Cloth:
+    """Of yarns as thick as they are crimped, or of another crimp, which pulls the cloth together or lets it out."""
+    distance, diameter = 1.0 / 2300.0, 1.6e-4
+    if crimp is None:
+        crimp = float(np.sqrt(1.0 + 9.0 / 8.0 * (diameter / distance) ** 2) - 1.0)
+    return wy.fabrics.cotton(rows=size, columns=size, weave=weave, pose="flat", crimp=crimp)
+
+
+def momentum(sim: wy.Simulator, state: wy.State) -> np.ndarray:
+    """Of all nodes, with what sliding yarns carry."""
+    n = len(state.position)
+    rates = np.concatenate([state.velocity.ravel(), state.euler_velocity.ravel()])
+    mass = matrix(sim, state, mass=1.0)
+    return (mass @ rates[: len(mass)])[: 3 * n].reshape(n, 3).sum(axis=0)
+
+
+@pytest.mark.parametrize("sliding", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_at_rest_it_stays_at_rest(sliding: bool) -> None:
+    c = cotton()
+    frames = wy.Simulator(wy.Scene(c, gravity=None, sliding=sliding, crimp_interchange=True)).run(5)
+    assert np.abs(frames.position[-1] - frames.position[0]).max() < 1e-12 * c.spacing * 1e3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sliding", [False, True])
+@pytest.mark.parametrize("weave", ["plain", "twill"])
+def test_thrown_it_keeps_its_momentum(weave: str, sliding: bool) -> None:
+    """And gains no energy."""
+    c = cotton(weave=weave)
+    sim = wy.Simulator(wy.Scene(c, gravity=None, sliding=sliding, crimp_interchange=True), newton_tolerance=1e-6)
+    state = sim.state
+    turning = np.cross([20.0, 5.0, 8.0], state.position - state.position.mean(axis=0))
+    state.velocity[:] = turning + np.array([0.3, 0.1, -0.2])
+    sim.state = state
+    before, energy = momentum(sim, sim.state), sum(sim.energy().values())
+    sim.run(10)
+    # what Newton's iteration leaves, in every step
+    assert np.abs(momentum(sim, sim.state) - before).max() < 1e-6 * np.abs(before).max()
+    assert sum(sim.energy().values()) < (1.0 + 1e-6) * energy
+
+
+@pytest.mark.slow
+def test_yarns_too_thick_for_their_crimp_draw_the_cloth_in() -> None:
+    """And yarns that are longer than goes with their thickness let it out, to where h₁ + h₂ = d₁ + d₂ and nothing
+    pulls: p = √(l² − β² h²)."""
+    for crimp in (0.05, 0.09):
+        c = cotton(crimp)
+        scene = wy.Scene(c, gravity=None, sliding=False, crimp_interchange=True, terms=["crimp_interchange"])
+        sim = wy.Simulator(scene, integrator="implicit-euler", step=1e-2)
+        sim.run(40)
+        middle = [c.node(2, 2), c.node(2, 3)]
+        found = np.linalg.norm(np.diff(sim.state.position[middle], axis=0))
+        expected = np.sqrt((c.spacing * (1.0 + crimp)) ** 2 - 9.0 / 8.0 * 1.6e-4**2)
+        assert (found < c.spacing) == (crimp < 0.07)
+        # crimp's own bending keeps some of it as woven, where the yarn is a thousand times softer across
+        assert abs(found / expected - 1.0) < 0.005
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["implicit-euler", "sdirk2", "implicit-midpoint", "linear"])
+def test_methods_agree(method: str) -> None:
+    """On a cloth that hangs and swings, at steps of 0.1 ms."""
+    c = cotton()
+
+    def end(method: str, step: float) -> np.ndarray:
+        scene = wy.Scene(c, pins=c.corners("top"), sliding=False, crimp_interchange=True)
+        return wy.Simulator(scene, integrator=method, step=step).run(round(5e-3 / step)).position[-1]
+
+    finest = end("sdirk2", 2.5e-5)
+    moved = np.abs(finest - c.position).max()
+    assert np.abs(end(method, 1e-4) - finest).max() < 0.05 * moved

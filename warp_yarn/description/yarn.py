@@ -1,0 +1,69 @@
+"""A yarn material."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+from ..errors import InputError, finite_array, real
+
+SIZES = ("radius", "width", "thickness")
+"""Sizes that a yarn may have of its own."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Yarn:
+    """A yarn material (paper, table 1).
+
+    A yarn may have a size of its own: either radius, or both width and thickness, the axes of its elliptic section. The
+    width is across the yarn in the plane of the cloth, by which neighbours touch and crossings lock; the thickness
+    across the cloth, by which warp and weft pass over each other. Sections are π/4 · width · thickness.
+
+    Args:
+        density: ρ, mass per length [kg/m], above 0.
+        stretch: Y, stretch modulus [Pa], at least 0. The stiffness of a yarn is kₛ = Y · section [N].
+        bend: B, bending modulus [Pa m²], at least 0. The stiffness of a yarn is k_b = B · section [N m²].
+        color: red, green, blue from 0 to 1, for pictures; None: chosen by its place in the cloth's list.
+        radius: R [m], above 0; None: that of the cloth, where width and thickness are None too.
+        width, thickness: [m], above 0.
+    """
+
+    density: float
+    stretch: float
+    bend: float
+    color: tuple[float, float, float] | None = None
+    radius: float | None = None
+    width: float | None = None
+    thickness: float | None = None
+
+    def __post_init__(self) -> None:
+        keep = functools.partial(object.__setattr__, self)  # frozen
+        keep("density", real("density", self.density, above=0.0))
+        keep("stretch", real("stretch", self.stretch, least=0.0))
+        keep("bend", real("bend", self.bend, least=0.0))
+        if self.color is not None:
+            color = finite_array("color", self.color, (3,))
+            if color.min() < 0.0 or color.max() > 1.0:
+                raise InputError(f"color = {self.color}, must be three numbers from 0 to 1")
+            keep("color", tuple(color.tolist()))
+        for name in SIZES:
+            if getattr(self, name) is not None:
+                keep(name, real(name, getattr(self, name), above=0.0))
+        if (self.width is None) != (self.thickness is None):
+            raise InputError(f"width = {self.width} and thickness = {self.thickness}, must both be given, or neither")
+        if self.radius is not None and self.width is not None:
+            raise InputError(
+                f"radius = {self.radius:g} and width = {self.width:g}, must be radius, or width and thickness"
+            )
+
+    @property
+    def sizes(self) -> tuple[float | None, ...]:
+        """What it has of ``SIZES`` of its own."""
+        return tuple(getattr(self, name) for name in SIZES)
+
+    def halves(self, radius: float) -> tuple[float, float]:
+        """Gives half the width and half the thickness [m], in a cloth of this radius."""
+        if self.width is not None and self.thickness is not None:
+            return 0.5 * self.width, 0.5 * self.thickness
+        own = radius if self.radius is None else self.radius
+        return own, own

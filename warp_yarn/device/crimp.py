@@ -1,0 +1,24 @@
+"""What a scene says of crimp, on the device."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from ..description import crimp
+
+if TYPE_CHECKING:
+    from .arrays import Arrays
+
+
+def set_arrays(arrays: Arrays) -> None:
+    """Sets what crimp interchange, or a contact force at crimped positions, has; nothing where a scene has neither."""
+    cloth = arrays.scene.cloth
+    if "crimp interchange" in arrays.conditions:
+        for name, values in crimp.interchange(cloth).items():
+            dtype = arrays.declared[name].dtype(arrays.variant)
+            arrays[name] = wp.array(np.ascontiguousarray(values), dtype=dtype, device=arrays.device)
+    if "crimped contact" in arrays.conditions:
+        arrays["contact_offset"] = arrays.numbers(0.5 * crimp.heights(cloth))
