@@ -37,7 +37,7 @@ from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
 from warp_yarn.device.defaults import stretch_rate
-from warp_yarn.presets.fabrics import FABRICS
+from warp_yarn.presets.fabrics import STUDIED
 from warp_yarn.simulation.state import CLOTH_NUMBERS
 
 TIGHT = {"newton_tolerance": 1e-10, "tolerance": 1e-12}
@@ -80,7 +80,7 @@ class Case:
         return cls(
             number=number,
             kind=kind,
-            fabric=list(FABRICS)[number // len(KINDS) % len(FABRICS)],
+            fabric=list(STUDIED)[number // len(KINDS) % len(STUDIED)],
             weave=str(rng.choice(list(wy.WEAVES))),
             rows=int(rng.integers(4, 10)),
             columns=int(rng.integers(4, 10)),
@@ -97,7 +97,7 @@ class Case:
 
     def cloth(self) -> wy.Cloth:
         """Make the cloth, of yarns that are as much stiffer."""
-        cloth = FABRICS[self.fabric](rows=self.rows, columns=self.columns, weave=self.weave)
+        cloth = STUDIED[self.fabric](rows=self.rows, columns=self.columns, weave=self.weave)
         yarns = [dataclasses.replace(yarn, stretch=self.stretch * yarn.stretch) for yarn in cloth.yarns]
         numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
         return wy.Cloth(cloth.weave, yarns=yarns, pose="upright" if self.number % 2 else "flat", **numbers)

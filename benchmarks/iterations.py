@@ -31,7 +31,7 @@ from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
 from warp_yarn.device.model import SOLVED
-from warp_yarn.presets.fabrics import FABRICS
+from warp_yarn.presets.fabrics import STUDIED
 from warp_yarn.simulation.state import CLOTH_NUMBERS
 
 TOLERANCE = 1e-6
@@ -49,7 +49,7 @@ SETTLED = 30
 
 def cloth_of(fabric: str, size: int, stretch: float = 1.0) -> wy.Cloth:
     """Make a flat cloth, of yarns that are as much stiffer."""
-    cloth = FABRICS[fabric](rows=size, columns=size, pose="flat")
+    cloth = STUDIED[fabric](rows=size, columns=size, pose="flat")
     yarns = [dataclasses.replace(yarn, stretch=stretch * yarn.stretch) for yarn in cloth.yarns]
     numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
     return wy.Cloth(cloth.weave, yarns=yarns, pose="flat", **numbers)
@@ -157,7 +157,7 @@ def of_stretch(size: int, most: int) -> Iterator[dict[str, Any]]:
 
 
 def of_jittered(size: int, most: int) -> Iterator[dict[str, Any]]:
-    for fabric, jitter, stage, sliding in itertools.product(FABRICS, JITTERS, STAGES, (False, True)):
+    for fabric, jitter, stage, sliding in itertools.product(STUDIED, JITTERS, STAGES, (False, True)):
         cloth = cloth_of(fabric, size)
         scene = wy.Scene(cloth, pins=cloth.corners("top"), sliding=sliding)
         about = {"fabric": fabric, "size": f"{size} × {size}", "jitter": jitter, "length": stage, "sliding": sliding}

@@ -54,7 +54,7 @@ def scene(cloth: wy.Cloth, friction: float, angle: float) -> wy.Scene:
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     normal = turn[:, 2]
     # where it touches, but hardly
-    above = 2.0 * cloth.radius * (1.0 - 1e-6)
+    above = 2.0 * cloth.half_thickness * (1.0 - 1e-6)
     flat = cloth.position - cloth.position.mean(axis=0) + [0.0, 0.0, above]
     plane = wy.Plane(point=(0, 0, 0), normal=normal, friction=friction)
     return wy.Scene(cloth.replace(pose=flat @ turn.T), gravity=(0, 0, -GRAVITY), obstacles=[plane])

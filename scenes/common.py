@@ -104,7 +104,7 @@ def add_weave(parser: argparse.ArgumentParser) -> None:
             raise argparse.ArgumentTypeError(str(error)) from error
         return text
 
-    text = f'{", ".join(wy.WEAVES)} (the paper\'s), or words such as "2/2 twill Z" and "satin 5/2" (plain)'
+    text = f'{", ".join(wy.WEAVES)} (the paper\'s), or words such as "2/2 twill Z" and "satin 5/2" (that of the fabric)'
     parser.add_argument("--weave", type=words, metavar="WORDS", help=text)
     text = "a weaver's draft, .wif, .dtx or .wpo: its weave, repeated or cut to the size, and its colours"
     parser.add_argument("--draft", type=file_ending(*ENDINGS, *map(str.upper, ENDINGS)), metavar="FILE", help=text)
@@ -114,7 +114,8 @@ def woven_cloth(fabric: str, options: argparse.Namespace, rows: int, columns: in
     """A cloth of a fabric, woven as --weave or --draft say."""
     make = FABRICS[fabric]
     if options.draft is None:
-        return make(weave=options.weave or "plain", rows=rows, columns=columns, **more)
+        # without words a fabric has its own weave
+        return make(**({"weave": options.weave} if options.weave else {}), rows=rows, columns=columns, **more)
     if options.weave is not None:
         raise wy.InputError(f"--weave = {options.weave} does not go with --draft, which has its own")
     draft = wy.read_draft(options.draft).tiled(rows=rows, columns=columns)

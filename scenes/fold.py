@@ -42,8 +42,8 @@ def carried(cloth: wy.Cloth, steps: int) -> tuple[np.ndarray, np.ndarray]:
     start = cloth.position[pins]
     length = cloth.position[:, 0].max() - cloth.position[:, 0].min()
     angle = 0.5 * np.pi * (1.0 - np.cos(np.pi * np.arange(1, steps + 1) / steps))
-    across = 0.5 * (length - SHORT * cloth.spacing) * (1.0 - np.cos(angle))
-    up = 0.47 * length * np.sin(angle) + LAYERS * cloth.spacing * angle / np.pi
+    across = 0.5 * (length - SHORT * cloth.longest_spacing) * (1.0 - np.cos(angle))
+    up = 0.47 * length * np.sin(angle) + LAYERS * cloth.longest_spacing * angle / np.pi
     way = np.stack([across, np.zeros(steps), up], axis=1)
     return pins, start + way[:, None]
 
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
 def thickness(trajectory: wy.Trajectory) -> str:
     """How high the fold is at its edges, where they lie on each other, and where it turns."""
     cloth = trajectory.cloth
-    z = trajectory.position[-1, :, 2].reshape(cloth.weave.rows, cloth.weave.columns) / cloth.spacing
+    z = trajectory.position[-1, :, 2].reshape(cloth.weave.rows, cloth.weave.columns) / cloth.longest_spacing
     edge, turn = np.median(z[:, 0] - z[:, -1]), np.ptp(z, axis=1).max()
     return f"the edges lie {edge:.2f} spacings apart; the fold is {turn:.2f} spacings high"
 

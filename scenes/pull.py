@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         lower = touch.raised(cloth, 0.0)
         fewer = {"rows": options.rows - SMALLER, "columns": options.columns - SMALLER}
         smaller = argparse.Namespace(**{**vars(options), **fewer})
-        upper = touch.raised(touch.flat(smaller), LAYERS * cloth.spacing)
+        upper = touch.raised(touch.flat(smaller), LAYERS * cloth.longest_spacing)
         pins = [lower.node(-1, column) for column in range(options.columns)]
         path = lower.position[pins] + along[:, None]
         scene = touch.scene(lower, options, upper, obstacles=[floor], pins=pins, pin_path=path)

@@ -56,8 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     profile = zigzag(columns, layers)
     options.columns = len(profile)
     cloth = touch.flat(options)
-    x = np.tile(profile[:, 0], options.rows) * cloth.spacing
-    z = np.tile(profile[:, 1], options.rows) * cloth.spacing + touch.rest(cloth)
+    unit = cloth.node_spacing[0, 0]  # along a row
+    x = np.tile(profile[:, 0], options.rows) * unit
+    z = np.tile(profile[:, 1], options.rows) * unit + touch.rest(cloth)
     cloth = cloth.replace(pose=np.stack([x - x.mean(), cloth.position[:, 1], z], axis=1))
     floor = wy.Plane(point=(0, 0, 0), normal=(0, 0, 1), friction=options.friction)
     made = touch.run(touch.scene(cloth, options, obstacles=[floor]), options)
@@ -67,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
 def heights(trajectory: wy.Trajectory, columns: int, layers: int) -> str:
     """How far apart layers lie, in their middle."""
     cloth = trajectory.cloth
-    z = trajectory.position[-1, :, 2].reshape(cloth.weave.rows, cloth.weave.columns) / cloth.spacing
+    z = trajectory.position[-1, :, 2].reshape(cloth.weave.rows, cloth.weave.columns) / cloth.node_spacing[0, 0]
     middle = np.arange(layers) * (columns + TURN - 1) + columns // 2
     apart = np.diff(np.median(z[:, middle], axis=0))
     return f"layers lie {', '.join(f'{d:.2f}' for d in apart)} spacings apart, from below"

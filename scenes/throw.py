@@ -80,7 +80,7 @@ class Throw:
         )
         speed = self.distance / self.duration
         # An impulse of `scale` on each of so many variables moves the centre as one of √count times that on one.
-        self.scale = mass(cloth) * speed / (self.step * np.sqrt(PUSHED * 4)) if forces else speed
+        self.scale = cloth.mass * speed / (self.step * np.sqrt(PUSHED * 4)) if forces else speed
         self.shape = self.rollout.inputs["forces"] if forces else (3,)
 
     def start(self) -> torch.Tensor:
@@ -115,13 +115,6 @@ class Throw:
             velocity = np.broadcast_to(value, (cloth.nodes, 3))
             simulator.state = dataclasses.replace(simulator.state, velocity=velocity)
         return simulator.run(self.steps)
-
-
-def mass(cloth: wy.Cloth) -> float:
-    """Of all yarns [kg]."""
-    rows, columns = cloth.weave.rows, cloth.weave.columns
-    lengths = cloth.spacing * np.array([columns - 1] * rows + [rows - 1] * columns)
-    return float(lengths @ [cloth.yarns[k].density for k in cloth.material])
 
 
 @dataclasses.dataclass

@@ -88,7 +88,7 @@ def raised(cloth: wy.Cloth, height: float) -> wy.Cloth:
 
 def rest(cloth: wy.Cloth) -> float:
     """D + d̂ of the default, and a trifle [m]."""
-    return 2.0 * cloth.radius * (1.0 + 1e-6)
+    return 2.0 * cloth.half_thickness * (1.0 + 1e-6)
 
 
 def scene(cloth: wy.Cloth, options: argparse.Namespace, *others: wy.Cloth, **more: object) -> wy.Scene:
@@ -96,7 +96,7 @@ def scene(cloth: wy.Cloth, options: argparse.Namespace, *others: wy.Cloth, **mor
     contact = wy.Contact(friction=options.friction)
     if options.seed is not None:
         aside = np.random.default_rng(options.seed).uniform(-0.01, 0.01, cloth.position.shape)
-        cloth = cloth.replace(pose=cloth.position + cloth.spacing * aside)
+        cloth = cloth.replace(pose=cloth.position + cloth.shortest_spacing * aside)
     return wy.Scene([cloth, *others], sliding=not options.locked, self_contact=True, contact=contact, **more)
 
 
@@ -179,9 +179,9 @@ def clearance(trajectory: wy.Trajectory) -> Clearance:
     """Looks at every frame."""
     cloth, frames = trajectory.cloth, len(trajectory)
     law = wy.Contact() if trajectory.scene is None else trajectory.scene.contact
-    distance = law.distance or cloth.radius
-    self_distance = law.self_distance or max(1.5 * cloth.spacing, 3.0 * cloth.radius)
-    reach = self_distance + (law.self_range or cloth.spacing)
+    distance = law.distance or cloth.half_thickness
+    self_distance = law.self_distance or max(1.5 * cloth.longest_spacing, 3.0 * cloth.half_thickness)
+    reach = self_distance + (law.self_range or cloth.longest_spacing)
     gap, apart = np.full(frames, np.inf), np.full(frames, np.inf)
     for each in placed(trajectory):
         for frame in range(frames):

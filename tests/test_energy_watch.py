@@ -12,7 +12,7 @@ from warp_yarn.kernels.stepping.energy_watch import EVERY
 import warp_yarn as wy
 import warp_yarn.torch as wt
 from warp_yarn.integrators import INTEGRATORS
-from warp_yarn.presets.fabrics import FABRICS
+from warp_yarn.presets.fabrics import FABRICS, STUDIED
 
 METHODS = tuple(INTEGRATORS)
 
@@ -195,7 +195,7 @@ def watched(fabric: str, acts, method: str, sliding: bool, *, watches: bool, ste
 
 
 @pytest.mark.parametrize("sliding", [False, True])
-@pytest.mark.parametrize("fabric", quick(FABRICS, "cotton"))
+@pytest.mark.parametrize("fabric", quick(STUDIED, "cotton"))
 @pytest.mark.parametrize("acts", SCENES)
 def test_no_false_alarm(acts, fabric, sliding):
     with_it = watched(fabric, acts, "sdirk2", sliding, watches=True)

@@ -33,7 +33,7 @@ def uneven(rows: int, columns: int, **options: object) -> wy.Cloth:
     return fabrics.handkerchief(rows, columns, **numbers, **options)
 
 
-CLOTHS = {**fabrics.FABRICS, "uneven": uneven}
+CLOTHS = {**fabrics.STUDIED, "uneven": uneven}
 
 
 @functools.cache

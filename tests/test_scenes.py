@@ -52,7 +52,7 @@ def test_wind_weave_yarns_and_size_are_the_ones_asked_for(usd):
     assert UsdGeom.Mesh(Usd.Stage.Open(str(usd)).GetPrimAtPath("/cloth/yarn_0"))
 
 
-@pytest.mark.parametrize("fabric", wy.fabrics.FABRICS)
+@pytest.mark.parametrize("fabric", [*wy.fabrics.STUDIED, "denim"])
 def test_the_fabric_is_the_one_asked_for(fabric, usd, tmp_path):
     record = str(tmp_path / "first.npz")
     arguments = ["--fabric", fabric, "--size", "4", "--weave", "satin", "--steps", "2", "--output", str(usd)]

@@ -26,7 +26,7 @@ def usd(tmp_path: Path) -> Path:
     return tmp_path / "new folder" / "throw.usdc"
 
 
-@pytest.mark.parametrize("fabric", wy.fabrics.FABRICS)
+@pytest.mark.parametrize("fabric", [*wy.fabrics.STUDIED, "denim"])
 def test_a_learned_velocity_is_that_of_a_thrown_point(fabric, usd, capsys):
     result = throw.main([*SMALL, "--fabric", fabric, "--output", str(usd)])
     # The default of --within: the search ends there.

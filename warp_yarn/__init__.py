@@ -9,6 +9,7 @@ from .description.cloth import Cloth
 from .description.cloths import Cloths
 from .description.crimp import crimp_height
 from .description.draft import Draft
+from .description.fibre import FIBRES, Fibre
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
@@ -33,6 +34,7 @@ moved.install()
 __version__ = importlib.metadata.version("warp_yarn")
 
 __all__ = [
+    "FIBRES",
     "WEAVES",
     "Box",
     "Camera",
@@ -42,6 +44,7 @@ __all__ = [
     "Contact",
     "Cylinder",
     "Draft",
+    "Fibre",
     "GradientError",
     "InputError",
     "Plane",

@@ -32,7 +32,7 @@ def selected_terms(scene: Scene, names: Sequence[str] | None) -> tuple[str, ...]
 
 
 def lacks(scene: Scene, term: Term) -> str:
-    """Says why the scene has no use for a term, or ""."""
+    """Tells why the scene has no use for a term, or ""."""
     if term.sliding_only and not scene.sliding:
         return "yarns do not slide (sliding=False)"
     for parameter in () if own(term) else term.parameters:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 from ..errors import InputError, finite_array, real
+from . import fibre as fibres
 
 SIZES = ("radius", "width", "thickness")
 """Sizes that a yarn may have of its own."""
@@ -55,6 +57,48 @@ class Yarn:
             raise InputError(
                 f"radius = {self.radius:g} and width = {self.width:g}, must be radius, or width and thickness"
             )
+
+    @classmethod
+    def from_tex(
+        cls,
+        tex: float,
+        fibre: fibres.Spun = "cotton",
+        *,
+        twist: float = 0.0,
+        packing: float | None = None,
+        radius: float | None = None,
+        width: float | None = None,
+        thickness: float | None = None,
+        color: tuple[float, float, float] | None = None,
+    ) -> Yarn:
+        """Makes a yarn of fibres that slip past each other as it bends.
+
+        It bends as all its fibres together, k_b = R_sf · tex · tex of one fibre, some hundred times softer than a solid
+        rod of its size, and within a factor of 2.5 of what is measured on cloth; free of friction between fibres. It
+        stretches as they do, kₛ = modulus · tex · cos²α, α the angle of the fibres at the surface, tan α = π d twist
+        (fibres on ideal helices; d the diameter of a round yarn of the same section).
+
+        Args:
+            tex: mass per length [g/km, 1e-6 kg/m], above 0.
+            fibre: a name of ``wy.FIBRES``, a ``wy.Fibre``, or parts by mass: {"polyester": 0.5, "cotton": 0.5}.
+            twist: [turns/m], at least 0.
+            packing: part of the section that is fibre, above 0, at most 0.907; None: that of the fibre. It gives what
+                is not known of the size: the radius of a round yarn, or the width, or the thickness.
+            radius, width, thickness: [m], above 0, where they are known: radius, or width or thickness or both.
+            color: as of a Yarn.
+
+        Warns of counts, twists and sizes that no yarn has.
+        """
+        of = fibres.find(fibre)
+        tex, twist = real("tex", tex, above=0.0), real("twist", twist, least=0.0)
+        size = fibres.sizes(of, tex, packing, radius, width, thickness)
+        yarn = cls(density=1e-6 * tex, stretch=0.0, bend=0.0, color=color, **size)
+        half_width, half_thickness = yarn.halves(math.nan)
+        angle = math.atan(2.0 * math.pi * math.sqrt(half_width * half_thickness) * twist)
+        fibres.warn_of_counts(of, tex, twist, angle)
+        section = math.pi * half_width * half_thickness
+        tension = of.modulus * tex * math.cos(angle) ** 2
+        return dataclasses.replace(yarn, stretch=tension / section, bend=1e-9 * of.flexural * tex * of.tex / section)
 
     @property
     def sizes(self) -> tuple[float | None, ...]:
