@@ -45,7 +45,7 @@ ONLY = {
     "torch": {f"{W}.gradients.{module}" for module in ("checkpoints", "fabric", "inputs", "parts", "rollout", "run")}
     | {f"{W}.calibration.problem"},
     "pxr": {f"{W}.io.usd"},
-    "h5py": {f"{W}.io.published"},
+    "h5py": {f"{W}.io.published", f"{W}.io.recordings"},
     "pyvista": set(),
     "scenes": set(),
     "benchmarks": set(),

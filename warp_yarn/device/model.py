@@ -12,7 +12,7 @@ import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
-from ..errors import InputError, choice, integer, real
+from ..errors import InputError, brief, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build
 from . import defaults
 from .arrays import Arrays
@@ -64,7 +64,7 @@ class Model:
         differentiable: bool,
     ):
         if not isinstance(scene, Scene):
-            raise InputError(f"scene = {scene!r}, must be a Scene")
+            raise InputError(f"scene = {brief(scene)}, must be a Scene")
         self.scene = scene
         self.step_size = real("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import errno
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..description.obstacles import TriangleMesh
 from ..errors import InputError, integer, real
-from ..simulation.state import Trajectory
-from ..view.geometry import OBSTACLE_COLOR, Placed, Strands, Tubes, placed, strands
-from .files import atomic_write
+from ..simulation.state import FIELDS, End, State, Trajectory
+from ..view.geometry import OBSTACLE_COLOR, Placed, Strands, Tubes, checked, placed, strands
+from .files import room
+from .films import Film
 
 if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
     from pxr import Gf, Usd, UsdGeom
 
 ENDINGS = (".usd", ".usda", ".usdc")
 COARSE = 1e-4
+SAVE_BYTES = 1 << 21
+"""Of points that are kept in memory until a file is saved."""
+CORNERS = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, 8).T == 1
+"""Of a box, whether they are at its higher end."""
 TUBE_SAMPLES = 4
 """Rings a segment: chords between them are within 7 % of the radius of the curve, in the paper's weaves."""
 
@@ -58,16 +65,15 @@ def write_usd(
         InputError: an argument is out of its range, or the folder of `path` does not exist.
         OSError: the file cannot be written, such as to a full disk.
     """
-    slowdown = real("slowdown", slowdown, above=0.0)
     sides = integer("sides", sides, least=3)
-    if Path(path).suffix not in ENDINGS:
-        raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
-    parts = strands(trajectory)
-    with atomic_write(path) as temporary, writing(path):
-        # a function of its own, so that no stage holds the file when it is moved: Windows would not move it
-        rate = 1.0 / (trajectory.step * slowdown)
-        _write_stage(temporary, trajectory, parts, placed(trajectory), tubes=tubes, rate=rate, sides=sides)
-    reload(path)
+    checked(trajectory)
+    stage = Stage(path, trajectory[:0], slowdown=slowdown, tubes=tubes, sides=sides, whole=trajectory)
+    few = max(1, SAVE_BYTES // (24 * trajectory.cloth.nodes))
+    with stage.all_or_nothing():
+        for first in range(0, len(trajectory), few):
+            stage.write(trajectory[first : first + few])
+        stage.frames = len(trajectory)
+    stage.finish(None)
 
 
 @contextlib.contextmanager
@@ -92,48 +98,121 @@ def reload(path: str | os.PathLike) -> None:
             layer.Reload(force=True)
 
 
-def _write_stage(
-    path: Path,
-    trajectory: Trajectory,
-    parts: list[Strands],
-    obstacles: list[Placed],
-    *,
-    tubes: bool,
-    rate: float,
-    sides: int,
-) -> None:
-    from pxr import Gf, Usd, UsdGeom
+class Stage(Film):
+    """A USD file in the making. A binary one is saved now and then, and what was saved takes no memory.
 
-    stage = Usd.Stage.CreateNew(str(path))
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    stage.SetTimeCodesPerSecond(rate)
-    stage.SetFramesPerSecond(rate)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(trajectory) - 1)
-    cloth = UsdGeom.Xform.Define(stage, "/cloth")
-    stage.SetDefaultPrim(cloth.GetPrim())
-    radius = trajectory.cloth.radius
-    origin = origins(trajectory)
-    if origin.any():
-        translate = cloth.AddTranslateOp()
-        if (origin == origin[0]).all():
-            translate.Set(Gf.Vec3d(*origin[0].tolist()))
-        else:
-            for frame, place in enumerate(origin.tolist()):
-                translate.Set(Gf.Vec3d(*place), frame)
-    for part in parts:
-        prim_path = cloth.GetPath().AppendChild(f"yarn_{part.material}")
-        if tubes:
-            shape = Tubes.around(part, radius, sides=sides, samples=TUBE_SAMPLES)
-            _write_mesh(UsdGeom.Mesh.Define(stage, prim_path), shape, part, origin)
-        else:
-            _write_curves(UsdGeom.BasisCurves.Define(stage, prim_path), part, radius, origin)
-    if obstacles:
-        UsdGeom.Scope.Define(stage, "/obstacles")
-    for k, each in enumerate(obstacles):
-        _write_obstacle(stage, f"/obstacles/{each.obstacle.shape}_{k}", each)
-    stage.Save()
+    Args:
+        path: where it shall appear.
+        head: a trajectory without frames.
+        slowdown, tubes, sides: as of ``write_usd``.
+        whole: all of the frames, where they are known from the beginning.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        head: Trajectory,
+        *,
+        slowdown: float,
+        tubes: bool,
+        sides: int = 8,
+        whole: Trajectory | None = None,
+    ):
+        from pxr import Usd, UsdGeom
+
+        slowdown = real("slowdown", slowdown, above=0.0)
+        if Path(path).suffix not in ENDINGS:
+            raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
+        self.head, self.whole, self.tubes, self.sides = head, whole, tubes, sides
+        self.length, self._unsaved = 0, 0
+        self._origins = None if whole is None else origins(whole)
+        self._translate: UsdGeom.XformOp | None = None
+        self._boxes: list[np.ndarray] = []
+        """Corners of a box around the cloth [8, 3] of each frame."""
+        self._last: dict[int, Tubes] = {}
+        super().__init__(path, reserve=2 * SAVE_BYTES if whole is None else 0)
+        with self.all_or_nothing(), writing(path):
+            self.stage = stage = Usd.Stage.CreateNew(str(self.temporary))
+            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+            UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+            rate = 1.0 / (head.step * slowdown)
+            stage.SetTimeCodesPerSecond(rate)
+            stage.SetFramesPerSecond(rate)
+            stage.SetStartTimeCode(0)
+            self.cloth = UsdGeom.Xform.Define(stage, "/cloth")
+            stage.SetDefaultPrim(self.cloth.GetPrim())
+
+    def add(self, state: State) -> None:
+        parts: dict[str, Any] = {name: getattr(state, name)[None] for name in FIELDS}
+        self.write(dataclasses.replace(self.head, **parts))
+
+    def write(self, frames: Trajectory) -> None:
+        """Adds some frames, and saves where there is much to save."""
+        from pxr import UsdGeom
+
+        first, radius = self.length, self.head.cloth.radius
+        with writing(self.path):
+            origin = self._placed(frames, first)
+            for part in strands(frames):
+                path = self.cloth.GetPath().AppendChild(f"yarn_{part.material}")
+                if self.tubes:
+                    before = self._last.get(part.material)
+                    shape = Tubes.around(part, radius, sides=self.sides, samples=TUBE_SAMPLES, before=before)
+                    self._last[part.material] = shape
+                    _write_mesh(UsdGeom.Mesh.Define(self.stage, path), shape, part, origin, first)
+                else:
+                    _write_curves(UsdGeom.BasisCurves.Define(self.stage, path), part, radius, origin, first)
+                self._unsaved += 12 * part.points.size // 3 * (TUBE_SAMPLES * self.sides if self.tubes else 1)
+        self.length += len(frames)
+        if self._unsaved > SAVE_BYTES and self.path.suffix != ".usda":
+            self._save()
+
+    def _placed(self, frames: Trajectory, first: int) -> np.ndarray:
+        """Finds where the points of frames are counted from [frames, 3] (m), and writes it down."""
+        from pxr import Gf
+
+        low, high = frames.position.min(axis=1), frames.position.max(axis=1)
+        self._boxes += list(np.where(CORNERS, high[:, None], low[:, None]))
+        given = self._origins
+        origin = origins(frames) if given is None else given[first : first + len(frames)]
+        if self._translate is None and origin.any():
+            self._translate = self.cloth.AddTranslateOp()
+            for frame in {0, first - 1} if first else ():
+                self._translate.Set(Gf.Vec3d(0.0), frame)
+        if self._translate is not None:
+            stays = given is not None and (given == given[0]).all()
+            for frame, place in enumerate(origin[:1].tolist() if stays else origin.tolist(), first):
+                self._translate.Set(Gf.Vec3d(*place), *(() if stays else (frame,)))
+        return origin
+
+    def _save(self) -> None:
+        """Saves what is not; not without room for it: USD would leave half a file, and not survive another try."""
+        if self.whole is None and self._unsaved + (1 << 16) > room(self.temporary):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+        with writing(self.path):
+            self.stage.Save()
+        self._unsaved = 0
+
+    def close(self, end: End | None) -> None:
+        from pxr import UsdGeom
+
+        self.stage.SetEndTimeCode(self.length - 1)
+        frames = self.whole or dataclasses.replace(self.head, position=np.array(self._boxes))
+        with writing(self.path):
+            self.stage.RemovePrim("/obstacles")  # of a first try
+            for k, each in enumerate(placed(frames)):
+                UsdGeom.Scope.Define(self.stage, "/obstacles")
+                _write_obstacle(self.stage, f"/obstacles/{each.obstacle.shape}_{k}", each)
+        self._save()
+        # no stage may hold the file when it is moved: Windows would not move it
+        self.drop()
+
+    def drop(self) -> None:
+        self.cloth = self.stage = self._translate = None
+
+    def finish(self, end: End | None) -> None:
+        super().finish(end)
+        reload(self.path)
 
 
 def _write_obstacle(stage: Usd.Stage, path: str, placed: Placed) -> None:
@@ -186,7 +265,7 @@ def origins(trajectory: Trajectory) -> np.ndarray:
     return 0.5 * (low + high)
 
 
-def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, origin: np.ndarray) -> None:
+def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, origin: np.ndarray, first: int) -> None:
     from pxr import UsdGeom, Vt
 
     curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
@@ -199,10 +278,10 @@ def _write_curves(curves: UsdGeom.BasisCurves, part: Strands, radius: float, ori
     _write_color(curves, part)
     repeated = part.repeated
     for frame, points in enumerate(part.points):
-        _write_points(curves, frame, points[repeated] - origin[frame], radius)
+        _write_points(curves, first + frame, points[repeated] - origin[frame], radius)
 
 
-def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndarray) -> None:
+def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndarray, first: int) -> None:
     from pxr import Vt
 
     corners, vertices = shape.faces()
@@ -210,7 +289,7 @@ def _write_mesh(mesh: UsdGeom.Mesh, shape: Tubes, part: Strands, origin: np.ndar
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(vertices.astype(np.int32)))
     _write_color(mesh, part)
     for frame in range(len(part.points)):
-        _write_points(mesh, frame, shape.vertices(frame) - origin[frame], 0.0)
+        _write_points(mesh, first + frame, shape.vertices(frame) - origin[frame], 0.0)
 
 
 def _write_color(shape: UsdGeom.PointBased, part: Strands) -> None:

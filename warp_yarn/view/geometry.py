@@ -15,7 +15,7 @@ from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.obstacles import Obstacle, TriangleMesh
 from ..device.exclusive import ALONE, compiling, refuse_recording
-from ..errors import InputError, finite_array
+from ..errors import InputError, brief, finite_array
 from ..kernels import Variant, build
 from ..simulation.state import Trajectory
 
@@ -94,14 +94,19 @@ class Tubes:
     sides: int
 
     @classmethod
-    def around(cls, strands: Strands, radius: float, *, sides: int, samples: int) -> Tubes:
-        """Makes tubes with `samples` rings a segment; rings do not twist, along the yarn or from frame to frame."""
+    def around(cls, strands: Strands, radius: float, *, sides: int, samples: int, before: Tubes | None = None) -> Tubes:
+        """Makes tubes with `samples` rings a segment; rings do not twist, along the yarn or from frame to frame, nor
+        from the last frame of those before."""
         counts, centres, tangents = strands.sampled(samples)
         start = counts.cumsum() - counts
         first = np.empty_like(tangents)
         # Any start at a right angle will do for frame 0. Later frames follow it: chosen anew, rings would jump.
-        axis = np.eye(3)[np.abs(tangents[0, start]).argmin(axis=1)]
-        first[0, start] = _unit(np.cross(tangents[0, start], axis))
+        if before is None:
+            axis = np.eye(3)[np.abs(tangents[0, start]).argmin(axis=1)]
+            first[0, start] = _unit(np.cross(tangents[0, start], axis))
+        else:
+            one, other = before.across[-1, start].swapaxes(0, 1)
+            first[0, start] = _transported(one, np.cross(one, other), tangents[0, start])
         for frame in range(1, len(first)):
             first[frame, start] = _transported(
                 first[frame - 1, start], tangents[frame - 1, start], tangents[frame, start]
@@ -190,8 +195,8 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
     """Lists the obstacles of a trajectory's scene.
 
     Args:
-        at: when its frames are, in steps since the first frame of the run [frames], which need not be whole; None: 0,
-            1, 2, ...
+        at: when its frames are, in frames since the first of the run [frames], which need not be whole; None: 0, 1, 2,
+            ...
     """
     if trajectory.scene is None:
         return []
@@ -199,7 +204,7 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
     points = trajectory.position
     result = []
     for obstacle in trajectory.scene.obstacles:
-        position, rotation = _poses(obstacle, trajectory.start + at)
+        position, rotation = _poses(obstacle, trajectory.start + trajectory.every * at)
         width = length = 0.0
         if obstacle.shape == "plane":
             # a rectangle of its own, which moves as it does, under all of the cloth at all times
@@ -261,7 +266,7 @@ def strands(trajectory: Trajectory) -> list[Strands]:
 def checked(trajectory: Trajectory) -> np.ndarray:
     """Gives the positions of a trajectory that can be drawn [frames, nodes, 3] (m), or an InputError."""
     if not isinstance(trajectory, Trajectory):
-        raise InputError(f"trajectory = {trajectory!r}, must be a Trajectory, such as Simulator.run returns")
+        raise InputError(f"trajectory = {brief(trajectory)}, must be a Trajectory, such as Simulator.run returns")
     position = finite_array("trajectory.position", trajectory.position, (None, trajectory.cloth.nodes, 3))
     if not len(position):
         raise InputError("trajectory has no frame, must have at least one")
