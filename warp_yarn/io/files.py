@@ -71,7 +71,7 @@ def room(path: Path) -> float:
     if resource is not None:
         limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
         if limit != resource.RLIM_INFINITY:
-            free = min(free, limit - path.stat().st_size)
+            free = min(free, limit - (path.stat().st_size if path.exists() else 0))
     return free
 
 

@@ -12,7 +12,10 @@ from typing import Any
 
 from ..errors import InputError, real
 from ..simulation.state import End, State, Trajectory
-from .files import atomic_write, deferred, ended_by_exception
+from .files import atomic_write, deferred, ended_by_exception, room
+
+MARGIN = 1 << 17
+"""Bytes of a file that no frame counts for: lists of what is where."""
 
 
 class Film:
@@ -33,7 +36,7 @@ class Film:
         self._reserve = self.temporary.with_name("reserve")
         try:
             if reserve:
-                self._reserve.write_bytes(bytes(reserve))
+                self._reserve.write_bytes(bytes(reserve + 2 * MARGIN))
         except BaseException:
             self._whole.__exit__(*sys.exc_info())
             raise
@@ -59,6 +62,15 @@ class Film:
                 raise
             raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self.path)) from error
         self.frames += 1
+
+    def needs(self, size: int) -> None:
+        """Looks whether so many bytes can be written, before a library leaves half of them and does not survive it.
+
+        Raises:
+            OSError: the disk is full, or the file larger than this process may write.
+        """
+        if size + MARGIN > room(self.temporary):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
 
     def _make_room(self) -> None:
         self._reserve.unlink(missing_ok=True)

@@ -66,8 +66,9 @@ class Recording(Film):
         self.origin = np.zeros(3)
         self.pending: list[State] = []
         self.written = 0
-        # a block, what a run goes on from, and what files have beside
-        super().__init__(path, reserve=self.block * frame + 4 * 13 * 8 * self.nodes + (1 << 16))
+        beside = sum(np.asarray(value).nbytes for value in head.head().values()) + 8 * sum(WIDTHS.values()) * self.nodes
+        self._size = frame
+        super().__init__(path, reserve=self.block * frame + beside)
 
     def add(self, state: State) -> None:
         if not self.written and not self.pending:
@@ -81,6 +82,7 @@ class Recording(Film):
     def flush(self) -> None:
         """Writes the frames that are kept."""
         if self.pending:
+            self.needs(len(self.pending) * self._size)
             values = {name: np.stack([getattr(state, name) for state in self.pending]) for name in self.moving}
             values["position"] -= self.origin
             self.append({name: np.ascontiguousarray(value, dtype=self.kind) for name, value in values.items()})
@@ -263,7 +265,7 @@ def load(path: str | os.PathLike, frames: slice | None) -> Trajectory:
         for name in FIELDS:
             value = source.read(name, taken, count)
             values[name] = finite_array(name, value, (len(taken), head.cloth.nodes, WIDTHS[name]))
-            values["position"] += origin
+        values["position"] += origin
         whole = dataclasses.replace(head, **values)
         if frames is None:
             return whole
@@ -282,6 +284,9 @@ def stream(path: str | os.PathLike) -> Iterator[State]:
     """Reads the frames of a recording one after the other, a few at a time."""
     head, count = head_of(path)
     few = max(1, BLOCK_BYTES // (8 * sum(WIDTHS.values()) * head.cloth.nodes))
+    with _named(path), _source(Path(path)) as source:
+        if not source.in_parts:
+            few = count
     for begin in range(0, count, few):
         frames = load(path, slice(begin, begin + few))
         yield from (frames[k] for k in range(len(frames)))
@@ -326,6 +331,11 @@ class _Source:
             numbered = sorted(key for key in data if key.startswith(f"{name}_") and key[len(name) + 1 :].isdigit())
             self.blocks[name] = numbered or [name]
 
+    @property
+    def in_parts(self) -> bool:
+        """Whether some of its frames can be read without the others."""
+        return self.data is not self.head or len(self.blocks["position"]) > 1
+
     def has(self, name: str) -> bool:
         return name in self.data
 
@@ -347,10 +357,9 @@ class _Source:
             if len(array) == 1 < count:
                 return np.broadcast_to(array[()], (len(frames), *array.shape[1:]))
             return array[frames.start : frames.stop : frames.step] if len(frames) else array[:0]
-        parts, begin = [], 0
-        for block in blocks:
-            array = self.data[block]
-            mine = np.array([k - begin for k in frames if begin <= k < begin + len(array)], dtype=int)
-            parts.append(array[mine])
-            begin += len(array)
-        return np.concatenate(parts)
+        # all of them have as many frames as the first, but for the last
+        parts, length = [], len(self._first)
+        for k in sorted({frame // length for frame in frames}):
+            mine = np.array([frame - k * length for frame in frames if frame // length == k])
+            parts.append(self.data[blocks[k]][mine])
+        return np.concatenate(parts) if parts else self.data[blocks[0]][:0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import errno
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from ..description.obstacles import TriangleMesh
 from ..errors import InputError, integer, real
 from ..simulation.state import FIELDS, End, State, Trajectory
 from ..view.geometry import OBSTACLE_COLOR, Placed, Strands, Tubes, checked, placed, strands
-from .files import room
 from .films import Film
 
 if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
@@ -130,7 +128,7 @@ class Stage(Film):
         self._boxes: list[np.ndarray] = []
         """Corners of a box around the cloth [8, 3] of each frame."""
         self._last: dict[int, Tubes] = {}
-        super().__init__(path, reserve=2 * SAVE_BYTES if whole is None else 0)
+        super().__init__(path, reserve=SAVE_BYTES if whole is None else 0)
         with self.all_or_nothing(), writing(path):
             self.stage = stage = Usd.Stage.CreateNew(str(self.temporary))
             UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -186,9 +184,9 @@ class Stage(Film):
         return origin
 
     def _save(self) -> None:
-        """Saves what is not; not without room for it: USD would leave half a file, and not survive another try."""
-        if self.whole is None and self._unsaved + (1 << 16) > room(self.temporary):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+        """Saves what is not."""
+        if self.whole is None:
+            self.needs(self._unsaved)
         with writing(self.path):
             self.stage.Save()
         self._unsaved = 0

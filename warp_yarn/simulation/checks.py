@@ -15,7 +15,7 @@ from ..integrators import INTEGRATORS
 from ..integrators.stage import StageMethod
 from .state import State
 
-CHUNK_BYTES = 1 << 24
+CHUNK_BYTES = 1 << 22
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
 
 FRAME_BYTES = 13 * 8

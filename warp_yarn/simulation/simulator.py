@@ -180,6 +180,7 @@ class Simulator(Inspection, Filming):
         Returns:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
+        integer("steps", steps, least=0, most=self.chunk)
         with self.lock:
             return self.stepper.make_chunk(steps)
 

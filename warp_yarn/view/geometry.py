@@ -7,6 +7,7 @@ border there is no normal and no offset. Between these points runs the Catmull-R
 from __future__ import annotations
 
 import dataclasses
+import weakref
 
 import numpy as np
 import warp as wp
@@ -53,8 +54,11 @@ class Strands:
     @property
     def repeated(self) -> np.ndarray:
         """For each control point its index in points: those of a yarn in order, the first and the last twice."""
-        yarns = np.split(np.arange(self.counts.sum()), self.counts.cumsum()[:-1])
-        return np.concatenate([np.pad(yarn, 1, mode="edge") for yarn in yarns])
+        times = np.ones(self.counts.sum(), dtype=int)
+        ends = self.counts.cumsum()
+        np.add.at(times, ends - self.counts, 1)
+        np.add.at(times, ends - 1, 1)
+        return np.repeat(np.arange(len(times)), times)
 
     def sampled(self, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Finds points on the curves, `samples` a segment and the last end.
@@ -246,8 +250,27 @@ def _turned(q: np.ndarray, points: np.ndarray) -> np.ndarray:
 def strands(trajectory: Trajectory) -> list[Strands]:
     """Lists the yarns of every material that the cloth uses, at every frame."""
     position = checked(trajectory)
-    cloth, topology = trajectory.cloth, trajectory.cloth.topology
+    cloth = trajectory.cloth
     offset = cloth.radius * contact_normals(cloth, position)
+    result = []
+    for k, nodes, counts, side in _layout(cloth):
+        points = position[:, nodes] + side[:, None] * offset[:, nodes]
+        result.append(Strands(k, cloth.yarns[k].color or PALETTE[k % len(PALETTE)], counts, points))
+    return result
+
+
+_LAYOUTS: weakref.WeakKeyDictionary[Cloth | Cloths, list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]] = (
+    weakref.WeakKeyDictionary()
+)
+"""Of cloths that were drawn: a film asks for every frame."""
+
+
+def _layout(cloth: Cloth | Cloths) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
+    """Lists the yarns of every material: its number, their nodes one after the other, how many each has, and on which
+    side of each node the yarn is."""
+    if cloth in _LAYOUTS:
+        return _LAYOUTS[cloth]
+    topology = cloth.topology
     order = np.argsort(topology.segment_yarn, kind="stable")
     segments = topology.segment_nodes[order]
     starts = np.flatnonzero(np.diff(topology.segment_yarn[order], prepend=-1))
@@ -257,9 +280,8 @@ def strands(trajectory: Trajectory) -> list[Strands]:
         mine = np.flatnonzero(cloth.material == k)
         nodes = np.concatenate([yarns[y] for y in mine])
         counts = np.array([len(yarns[y]) for y in mine])
-        side = np.repeat(2.0 * topology.yarn_direction[mine] - 1.0, counts)
-        points = position[:, nodes] + side[:, None] * offset[:, nodes]
-        result.append(Strands(k, cloth.yarns[k].color or PALETTE[k % len(PALETTE)], counts, points))
+        result.append((k, nodes, counts, np.repeat(2.0 * topology.yarn_direction[mine] - 1.0, counts)))
+    _LAYOUTS[cloth] = result
     return result
 
 
