@@ -20,17 +20,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tqdm
-from common import add_slowdown, command, file_ending, make_folders, write_all
-from matplotlib.figure import Figure
+from common import add_slowdown, command, file_ending, make_folders, optional, parse, write_all
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
 from warp_yarn.errors import finite_array, integer, real
 from warp_yarn.io.files import atomic_write
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets.fabrics import FABRICS
+
+with optional("torch"):
+    import torch
+
+    import warp_yarn.torch as wt
+with optional("bench"):
+    from matplotlib.figure import Figure
 
 GRAVITY = np.array([0.0, 0.0, -9.8])
 
@@ -235,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         InputError: an option that cannot be used.
         SimulationError, KeyboardInterrupt: what ended the search, after the best throw before was written.
     """
-    options = parser().parse_args(arguments)
+    options = parse(parser(), arguments)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
     integer("--iterations", options.iterations, least=1)

@@ -227,7 +227,9 @@ def test_wrong_trajectories(tmp_path, write, name):
 @pytest.mark.parametrize("module", ["pyvista", "imageio.v2", "imageio_ffmpeg"])
 def test_absent_packages_are_named(tmp_path, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(wy.InputError, match=rf"{module.split('.')[0]} is not .*pip install warp_yarn\[render\]"):
+    with pytest.raises(
+        wy.InputError, match=rf"{module.split('.')[0]} is not .*pip install .\.\[render\].*pip install .pyvista"
+    ):
         wy.write_mp4(tmp_path / "a.mp4", waving(), size=SIZE)
     assert os.listdir(tmp_path) == []
 

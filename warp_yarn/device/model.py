@@ -14,7 +14,7 @@ from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..errors import InputError, brief, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build
-from . import defaults
+from . import defaults, start
 from .arrays import Arrays
 from .contact import Contact
 from .declarations import INPUTS
@@ -237,7 +237,7 @@ class Model:
 def _checked_device(device: Any) -> Any:
     """Finds a device of Warp."""
     try:
-        return wp.get_device(device)
+        return start.device(device)
     except Exception as error:
         names = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"device = {device!r}, must be one of {names}") from error

@@ -274,6 +274,15 @@ def load(path: str | os.PathLike, frames: slice | None) -> Trajectory:
         return dataclasses.replace(dataclasses.replace(head, **there)[frames], **values)
 
 
+def is_one(path: str | os.PathLike) -> bool:
+    """Tells whether an HDF5 file is a recording, and not one of the paper's published data."""
+    try:
+        with _h5py().File(path) as file:
+            return "head" in file
+    except OSError:
+        return False
+
+
 def head_of(path: str | os.PathLike) -> tuple[Trajectory, int]:
     """Reads all but the frames of a recording, and counts them."""
     with _named(path), _source(Path(path)) as source:

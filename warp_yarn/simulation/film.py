@@ -91,7 +91,7 @@ class Filming:
 
         Args:
             paths: of USD files (.usd, .usdc; .usda is kept in memory until its end) and recordings (.npz; .h5 and .hdf5
-                need ``warp_yarn[data]``).
+                need the extra ``data``).
             steps, seconds, fps, progress: as of ``run``.
             after: a recording that ended where the simulator is. Its frames come first, and the new ones go on in their
                 time, at its frames a second. It may be one of ``paths``.

@@ -201,7 +201,7 @@ class Trajectory:
         """Writes the cloth, its scene, every frame, and what a run goes on from; the file appears whole or not at all.
 
         Args:
-            path: of the file, ending in .h5 or .hdf5 (needs ``warp_yarn[data]``), or an .npz of any name.
+            path: of the file, ending in .h5 or .hdf5 (needs the extra ``data``), or an .npz of any name.
             precision: of the frames, "double" or "single"; what a run goes on from is always double.
             compression: from 0 (none, fast) to 9 (small, slow).
 

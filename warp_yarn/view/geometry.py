@@ -15,6 +15,7 @@ import warp as wp
 from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.obstacles import Obstacle, TriangleMesh
+from ..device import start
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..errors import InputError, brief, finite_array
 from ..kernels import Variant, build
@@ -297,7 +298,7 @@ def checked(trajectory: Trajectory) -> np.ndarray:
 
 def contact_normals(cloth: Cloth | Cloths, position: np.ndarray) -> np.ndarray:
     """Computes unit normals from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
-    topology, device = cloth.topology, wp.get_device("cpu")
+    topology, device = cloth.topology, start.device("cpu")
     with ALONE, compiling():
         refuse_recording(device)
         kernel = build(Variant(wp.float64, True))["contact_normal"]

@@ -16,7 +16,7 @@ import numpy as np
 import tqdm
 
 from ..description.obstacles import TriangleMesh
-from ..errors import InputError, finite_array, integer, real
+from ..errors import InputError, finite_array, integer, missing_extra, real
 from ..io.files import atomic_write
 from ..simulation.state import Trajectory
 from .geometry import OBSTACLE_COLOR, Placed, Tubes, checked, placed, strands
@@ -52,7 +52,7 @@ def write_png(
     """Draws one frame of a trajectory: every yarn a smooth tube in the colour of its material; and the obstacles, of a
     plane a rectangle beneath the cloth.
 
-    Needs ``warp_yarn[render]``. The same picture is the same to the last pixel on one machine. The file appears whole
+    Needs the extra ``render``. The same picture is the same to the last pixel on one machine. The file appears whole
     or not at all.
 
     Args:
@@ -91,7 +91,7 @@ def write_mp4(
     """Draws a trajectory as a movie (H.264), seen by a camera that stands still.
 
     Picture k shows time k / (frames_per_second · slowdown); between two frames of the trajectory every node is taken
-    to move along a straight line, and every obstacle to move and turn steadily. Needs ``warp_yarn[render]``. The file
+    to move along a straight line, and every obstacle to move and turn steadily. Needs the extra ``render``. The file
     appears whole or not at all.
 
     Args:
@@ -124,6 +124,18 @@ def write_mp4(
         with writer:
             for frame in tqdm.trange(len(movie), desc="drawing", unit="picture", disable=not progress):
                 writer.append_data(picture.drawn(frame))
+
+
+def check_drawing(*, movies: bool = False) -> None:
+    """Finds out whether pictures, or movies too, can be drawn, before there is anything to draw.
+
+    Raises:
+        InputError: an extra is not installed, or the machine has no OpenGL.
+    """
+    _pyvista()
+    if movies:
+        _extra("imageio.v2")
+        _extra("imageio_ffmpeg")
 
 
 class _Picture:
@@ -293,7 +305,7 @@ def _extra(module: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         name = module.partition(".")[0]
-        raise InputError(f"{name} is not installed, which pictures need: pip install warp_yarn[render]") from error
+        raise missing_extra(name, "pictures need", "render") from error
 
 
 _LOADING = threading.Lock()
