@@ -532,20 +532,6 @@ def test_a_process_that_is_ended_leaves_whole_files(tmp_path, number):
     assert sim.run(npz.steps_done, fps=100) == npz and sim.state == npz.end.state
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A disk of 3 MB, where this process may mount one."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(folder)]
-    try:
-        subprocess.run(mount, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("needs the right to mount a disk")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
-
-
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_full_disk_leaves_what_was_there_and_another_disk_has_room(tmp_path, small_disk, monkeypatch, ending):
     for module, name in ((recordings, "BLOCK_BYTES"), (usd, "SAVE_BYTES")):
