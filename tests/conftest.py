@@ -1,5 +1,5 @@
-"""Keeps Warp quiet and torch to one thread, gives the tests of a term their cases, has the option --shuffled, and a disk
-that fills up."""
+"""Keeps Warp quiet and torch to one thread, gives the tests of a term their cases, has the option --shuffled, and a
+disk that fills up."""
 
 import subprocess
 from collections.abc import Iterator
