@@ -427,6 +427,28 @@ def test_a_film_goes_on_twice_and_elsewhere(tmp_path):
     assert wy.Trajectory.load(path) == film
 
 
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+def test_a_recording_is_not_lost_while_it_is_copied(tmp_path, monkeypatch, ending):
+    """Stopped before all of the frames of before are in the new file: the old one stays."""
+    path = tmp_path / f"a{ending}"
+    simulator().record(path, steps=9)
+    before, sim = path.read_bytes(), wy.Simulator.resumed(path)
+    stream = recordings.stream
+
+    def stopping(path):
+        for k, frame in enumerate(stream(path)):
+            if k == 5:
+                raise _Stop
+            yield frame
+
+    monkeypatch.setattr(recordings, "stream", stopping)
+    with pytest.raises(_Stop):
+        sim.record(path, tmp_path / "a.usdc", steps=3, after=path)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == [path.name]
+    monkeypatch.setattr(recordings, "stream", stream)
+    assert sim.record(path, steps=3, after=path) == 13
+
+
 def test_steps_that_follow_their_error_go_on_too(tmp_path):
     """By the size of the last part, which a recording has."""
     options = {"step": 0.01, "step_error": 0.05}

@@ -55,7 +55,7 @@ class CalibrationProblem:
 
     Args:
         scene: the model; what is not learned keeps its values.
-        target: the frames.
+        target: the frames; where ``pin_path`` or ``forces`` change, every step of a run from its beginning.
         parameters: what to learn.
         frames: how many frames to compare with, at least 1; None: all that there are.
         first: the frame to start from.

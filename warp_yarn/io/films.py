@@ -46,7 +46,7 @@ class Film:
         raise NotImplementedError
 
     def close(self, end: End | None) -> None:
-        """Writes what is left, and makes the file whole. It may be called again where that failed."""
+        """Writes what is left, and makes the file whole."""
         raise NotImplementedError
 
     def drop(self) -> None:
@@ -77,16 +77,10 @@ class Film:
 
     def finish(self, end: End | None) -> None:
         """Makes the file appear, with the frames that were added; without any there is none."""
+        self._make_room()
         try:
             if self.frames:
-                try:
-                    self.close(end)
-                except OSError:
-                    if not self._reserve.exists():
-                        raise
-                    self._make_room()
-                    self.close(end)
-            self._make_room()
+                self.close(end)
         except BaseException:
             self.drop()
             self._whole.__exit__(*sys.exc_info())
@@ -119,11 +113,13 @@ class Films:
     """Films of one run, which get the same frames.
 
     Attributes:
+        frames: how many they got.
+        wanted: whether they are to appear with what they have: not before they have more than what was there.
         end: what a run goes on from that leaves these frames.
     """
 
     def __init__(self, films: Sequence[Film]):
-        self.films, self.frames = films, 0
+        self.films, self.frames, self.wanted = films, 0, True
         self.end: End | None = None
 
     def take(self, frames: Iterable[State]) -> None:
@@ -147,14 +143,18 @@ def open_films(makers: Iterable[Callable[[], Film]]) -> Iterator[Films]:
     with ended_by_exception():
         try:
             for make in makers:
-                films.append(make())
+                with deferred():
+                    films.append(make())
             yield result
         finally:
             with deferred():
                 failures = []
                 for film in films:
                     try:
-                        film.finish(result.end)
+                        if result.wanted:
+                            film.finish(result.end)
+                        else:
+                            film.discard()
                     except OSError as error:
                         failures.append(error)
                 if failures:

@@ -198,8 +198,6 @@ class Hdf5(Recording):
         assert self._file is not None
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **head)
-        if "head" in self._file:  # of a first try
-            del self._file["head"]
         self._file["head"] = np.frombuffer(buffer.getbuffer(), dtype=np.uint8)
         self._file.close()
         self._file = None

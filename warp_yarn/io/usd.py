@@ -128,7 +128,9 @@ class Stage(Film):
         self._boxes: list[np.ndarray] = []
         """Corners of a box around the cloth [8, 3] of each frame."""
         self._last: dict[int, Tubes] = {}
-        super().__init__(path, reserve=SAVE_BYTES if whole is None else 0)
+        # for what is not saved when the disk is full, and the frame that it is full at
+        frame = 24 * head.cloth.nodes * (TUBE_SAMPLES * sides if tubes else 1)
+        super().__init__(path, reserve=SAVE_BYTES + 2 * frame if whole is None else 0)
         with self.all_or_nothing(), writing(path):
             self.stage = stage = Usd.Stage.CreateNew(str(self.temporary))
             UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -197,7 +199,6 @@ class Stage(Film):
         self.stage.SetEndTimeCode(self.length - 1)
         frames = self.whole or dataclasses.replace(self.head, position=np.array(self._boxes))
         with writing(self.path):
-            self.stage.RemovePrim("/obstacles")  # of a first try
             for k, each in enumerate(placed(frames)):
                 UsdGeom.Scope.Define(self.stage, "/obstacles")
                 _write_obstacle(self.stage, f"/obstacles/{each.obstacle.shape}_{k}", each)

@@ -123,7 +123,10 @@ class Filming:
         walk = Walk(self, pace, progress)
         with open_films([film(path, head, written, shown) for path in paths]) as films:
             if earlier is not None:
+                # an incomplete copy would take the place of the whole
+                films.wanted = False
                 films.take(earlier.frames())
+                films.wanted = True
             before = films.frames
             try:
                 films.take(walk)
