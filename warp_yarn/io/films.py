@@ -36,7 +36,9 @@ class Film:
         self._reserve = self.temporary.with_name("reserve")
         try:
             if reserve:
-                self._reserve.write_bytes(bytes(reserve + 2 * MARGIN))
+                with open(self._reserve, "wb") as file:
+                    for _ in range(0, reserve + MARGIN, MARGIN):
+                        file.write(bytes(MARGIN))
         except BaseException:
             self._whole.__exit__(*sys.exc_info())
             raise

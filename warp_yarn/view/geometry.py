@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import weakref
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -264,6 +265,8 @@ _LAYOUTS: weakref.WeakKeyDictionary[Cloth | Cloths, list[tuple[int, np.ndarray, 
     weakref.WeakKeyDictionary()
 )
 """Of cloths that were drawn: a film asks for every frame."""
+_CROSSINGS: weakref.WeakKeyDictionary[Cloth | Cloths, list[Any]] = weakref.WeakKeyDictionary()
+"""Of the same cloths, on the device: arguments of the kernel that finds normals."""
 
 
 def _layout(cloth: Cloth | Cloths) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
@@ -298,18 +301,19 @@ def checked(trajectory: Trajectory) -> np.ndarray:
 
 def contact_normals(cloth: Cloth | Cloths, position: np.ndarray) -> np.ndarray:
     """Computes unit normals from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
-    topology, device = cloth.topology, start.device("cpu")
+    device = start.device("cpu")
     with ALONE, compiling():
         refuse_recording(device)
         kernel = build(Variant(wp.float64, True))["contact_normal"]
+        if cloth not in _CROSSINGS:
+            topology = cloth.topology
+            kinds = {"crossing_node": int, "crossing_neighbours": wp.vec4i, "flipped": int}
+            _CROSSINGS[cloth] = [wp.array(getattr(topology, k), dtype=kind, device=device) for k, kind in kinds.items()]
         positions = wp.array(position, dtype=wp.vec3d, device=device)
         normals = wp.zeros_like(positions)
-        crossings = wp.array(topology.crossing_node, dtype=int, device=device)
-        neighbours = wp.array(topology.crossing_neighbours, dtype=wp.vec4i, device=device)
-        flipped = wp.array(topology.flipped, dtype=int, device=device)
+        dim = len(_CROSSINGS[cloth][0])
         for frame in range(len(position)):
-            inputs = [crossings, neighbours, flipped, positions[frame], normals[frame]]
-            wp.launch(kernel, dim=len(crossings), inputs=inputs, device=device)
+            wp.launch(kernel, dim=dim, inputs=[*_CROSSINGS[cloth], positions[frame], normals[frame]], device=device)
         return normals.numpy()
 
 
