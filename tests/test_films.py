@@ -332,6 +332,7 @@ def test_a_missing_library_is_found_before_the_first_step(tmp_path, monkeypatch)
     assert sim.steps_done == 0 and not os.listdir(tmp_path)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_frames(tmp_path):
     """Frames of 1.7 kB, of which blocks of 16 kB are kept."""
     sim = simulator()
@@ -536,6 +537,7 @@ sim.record(*sys.argv[1:], steps=10**7, fps=100)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends processes without a signal")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "SIGINT"])
 def test_a_process_that_is_ended_leaves_whole_files(tmp_path, number):
@@ -554,6 +556,7 @@ def test_a_process_that_is_ended_leaves_whole_files(tmp_path, number):
     assert sim.run(npz.steps_done, fps=100) == npz and sim.state == npz.end.state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_full_disk_leaves_what_was_there_and_another_disk_has_room(tmp_path, small_disk, monkeypatch, ending):
     for module, name in ((recordings, "BLOCK_BYTES"), (usd, "SAVE_BYTES")):

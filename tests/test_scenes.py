@@ -114,6 +114,7 @@ def test_a_recording_without_a_scene_is_not_resumed(usd, tmp_path, capsys):
     assert "has no scene to go on with" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_ends_with_code_2_and_keeps_the_frames(usd, tmp_path, small_disk, capsys, monkeypatch):
     """Those until then are in the file, and where temporary files go for --resume; pictures are drawn."""
     (tmp_path / "temporary").mkdir()
@@ -203,6 +204,7 @@ def test_a_missing_extra_is_found_before_the_run(scene, option, package, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "packages", "extra"),
     [
