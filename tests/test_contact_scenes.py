@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom
 from scripts import exit_code, load
 
 import warp_yarn as wy
-from warp_yarn.simulation.state import SHAPES
+from warp_yarn.simulation.packing import SHAPES
 from warp_yarn.view import geometry
 
 touch = load("scenes/touch.py")

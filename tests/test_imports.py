@@ -49,7 +49,7 @@ ONLY = {
     "gymnasium": {f"{W}.envs", f"{W}.envs.throw"},
     "stable_baselines3": set(),
     "pxr": {f"{W}.io.usd", f"{W}.io.usd_prims"},
-    "h5py": {f"{W}.io.published"},
+    "h5py": {f"{W}.io.published", f"{W}.io.recordings"},
     "dtx_to_wif": {f"{W}.io.draft"},
     "viser": set(),
     "scenes": set(),

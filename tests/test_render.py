@@ -11,7 +11,7 @@ from internals import Picture, picture_times
 from waving import BLUE, RED, waving
 
 import warp_yarn as wy
-from warp_yarn.simulation.state import SHAPES
+from warp_yarn.simulation.packing import SHAPES
 from warp_yarn.view import camera, geometry, raster, render, solids, yarns
 
 SIZE = (160, 120)
@@ -297,7 +297,9 @@ def test_wrong_trajectories(tmp_path, write, name):
 @pytest.mark.parametrize("module", ["imageio.v2", "imageio_ffmpeg"])
 def test_absent_packages_are_named(tmp_path, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(wy.InputError, match=rf"{module.split('.')[0]} is not .*pip install warp_yarn\[render\]"):
+    with pytest.raises(
+        wy.InputError, match=rf"{module.split('.')[0]} is not .*pip install .\.\[render\].*pip install .imageio"
+    ):
         wy.write_mp4(tmp_path / "a.mp4", waving(), size=SIZE)
     assert os.listdir(tmp_path) == []
 

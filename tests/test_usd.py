@@ -12,7 +12,7 @@ from waving import BLUE, RED, waving
 
 import warp_yarn as wy
 from warp_yarn.io import usd
-from warp_yarn.simulation.state import SHAPES
+from warp_yarn.simulation.packing import SHAPES
 from warp_yarn.view import geometry, solids, yarns
 
 SINGLE = 8e-9

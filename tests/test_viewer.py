@@ -123,7 +123,7 @@ def test_wrong_arguments(options, message):
 
 def test_without_viser_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(wy.InputError, match=r"viser is not installed.*pip install warp_yarn\[view\]"):
+    with pytest.raises(wy.InputError, match=r'viser is not installed.*pip install "\.\[view\]".*pip install "viser'):
         wy.view(simulator())
 
 

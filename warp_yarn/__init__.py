@@ -14,7 +14,7 @@ from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Spher
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
-from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
+from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError, missing_extra
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
 from .io.draft import read_draft, write_draft
@@ -95,4 +95,4 @@ def __getattr__(name: str) -> ModuleType:
         if error.name != "torch":
             raise
         # what hasattr and getattr with a default take for an answer
-        raise NoAttributeError("gradients need torch: pip install warp_yarn[torch]") from error
+        raise NoAttributeError(str(missing_extra("torch", "gradients need", "torch"))) from error

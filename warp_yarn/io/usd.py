@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..description.cloth import Cloth
+from ..description.cloths import Cloths
 from ..errors import InputError, integer, real
-from ..simulation.state import Trajectory
-from ..view.geometry import OBSTACLE_COLOR, Placed, checked, placed
+from ..simulation.state import End, State, Trajectory
+from ..view.geometry import OBSTACLE_COLOR, checked, placed
 from ..view.yarns import Strands, Weaving
-from .files import atomic_write
-from .usd_prims import Curves, Shape, Surface, TubeMesh, bind, linear, material, vectors, write_obstacle, write_points
+from .films import Film
+from .usd_prims import (
+    TUBE_SAMPLES,
+    Curves,
+    Shape,
+    Surface,
+    TubeMesh,
+    bind,
+    linear,
+    material,
+    vectors,
+    write_obstacle,
+    write_points,
+)
 
 if TYPE_CHECKING:  # who writes no USD file need not load its library: functions import it
     from pxr import UsdGeom
@@ -23,8 +38,10 @@ if TYPE_CHECKING:  # who writes no USD file need not load its library: functions
 LAYERS = (".usd", ".usda", ".usdc")
 ENDINGS = (*LAYERS, ".usdz")
 COARSE = 1e-4
-PENDING = 1 << 26
-"""Bytes of frames that are kept in memory until they are written."""
+SAVE_BYTES = 1 << 21
+"""Of points that are kept in memory until a file is saved."""
+CORNERS = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, 8).T == 1
+"""Of a box, whether they are at its higher end."""
 
 
 def write_usd(
@@ -74,29 +91,48 @@ def write_usd(
         InputError: an argument is out of its range, or the folder of `path` does not exist.
         OSError: the file cannot be written, such as to a full disk.
     """
-    slowdown = real("slowdown", slowdown, above=0.0)
-    sides = integer("sides", sides, least=3)
-    fps = real("fps", fps, above=0.0)
-    if Path(path).suffix not in ENDINGS:
-        raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
     position = checked(trajectory)
-    options = {"tubes": tubes, "slowdown": slowdown, "sides": sides, "fps": fps}
-    options |= {"velocities": velocities, "surface": surface, "selvedge": selvedge}
-    with atomic_write(path) as temporary, writing(path):
-        packed = temporary.suffix == ".usdz"
-        layer = temporary.with_suffix(".usdc") if packed else temporary
-        # of a function of its own, so that no stage holds the file when it is moved: Windows would not move it
-        _write_frames(layer, trajectory, position, options)
-        if packed:
-            pack(layer, temporary)
-    reload(path)
+    look = options(
+        tubes=tubes,
+        slowdown=slowdown,
+        sides=sides,
+        fps=fps,
+        velocities=velocities,
+        surface=surface,
+        selvedge=selvedge,
+    )
+    stage = Stage(path, trajectory[:0], look, whole=trajectory)
+    with stage.all_or_nothing():
+        for frame, origin in enumerate(origins(trajectory)):
+            stage.write(position[frame], trajectory.velocity[frame], trajectory.euler[frame], origin)
+        stage.frames = len(trajectory)
+    stage.finish(None)
 
 
-def _write_frames(layer: Path, trajectory: Trajectory, position: np.ndarray, options: dict[str, Any]) -> None:
-    frames = UsdFrames(layer, trajectory, placed(trajectory), **options)
-    for frame, origin in enumerate(origins(trajectory)):
-        frames.add(position[frame], trajectory.velocity[frame], trajectory.euler[frame], origin)
-    frames.close()
+def options(
+    *,
+    tubes: bool = False,
+    slowdown: float = 1.0,
+    sides: int = 8,
+    fps: float = 24.0,
+    velocities: bool = True,
+    surface: bool = False,
+    selvedge: bool = False,
+) -> dict[str, Any]:
+    """Checks what ``write_usd`` takes beside a path and frames.
+
+    Raises:
+        InputError: one of them is out of its range.
+    """
+    return {
+        "tubes": tubes,
+        "slowdown": real("slowdown", slowdown, above=0.0),
+        "sides": integer("sides", sides, least=3),
+        "fps": real("fps", fps, above=0.0),
+        "velocities": velocities,
+        "surface": surface,
+        "selvedge": selvedge,
+    }
 
 
 def pack(layer: Path, path: Path) -> None:
@@ -130,35 +166,45 @@ def reload(path: str | os.PathLike) -> None:
             layer.Reload(force=True)
 
 
-class UsdFrames:
-    """A USD file in the making, to which frames are added as they come.
+class Stage(Film):
+    """A USD file in the making. A binary one is saved now and then, and what was saved takes no memory.
 
     Args:
-        path: of the file, which is not there yet.
-        trajectory: its cloth, scene and step; its frames do not matter.
-        obstacles: where they are at each of the frames to come.
-        others: as of ``write_usd``.
+        path: where it shall appear.
+        head: a trajectory without frames.
+        look: what ``options`` gives.
+        whole: all of the frames, where they are known from the beginning.
     """
 
     def __init__(
-        self,
-        path: Path,
-        trajectory: Trajectory,
-        obstacles: Sequence[Placed],
-        *,
-        tubes: bool,
-        slowdown: float,
-        sides: int,
-        fps: float,
-        velocities: bool,
-        surface: bool,
-        selvedge: bool,
+        self, path: str | os.PathLike, head: Trajectory, look: Mapping[str, Any], *, whole: Trajectory | None = None
     ):
+        if Path(path).suffix not in ENDINGS:
+            raise InputError(f"path = {str(path)!r}, must end in {', '.join(ENDINGS)}")
+        self.head, self.whole, self.look = head, whole, look
+        self.apart = head.step * look["slowdown"] * look["fps"]
+        self.length, self._unsaved = 0, 0
+        self._boxes: list[np.ndarray] = []
+        """Corners of a box around the cloth [8, 3] of each frame."""
+        self._translate: UsdGeom.XformOp | None = None
+        self._origin: tuple[np.ndarray, float] | None = None
+        # a selvedge's yarns run on in each other, and so have no u and v of their own
+        self.slides = not look["selvedge"] and (head.scene is None or head.scene.sliding)
+        self.weaving = Weaving(head.cloth, selvedge=look["selvedge"])
+        around = TUBE_SAMPLES * look["sides"] if look["tubes"] else 1
+        # for what is not saved when the disk is full, and the frame that it is full at
+        size = self._size(around * sum(2 + len(strands.places) for strands in self.weaving.strands))
+        super().__init__(path, reserve=SAVE_BYTES + 2 * size if whole is None else 0)
+        packed = self.temporary.suffix == ".usdz"
+        self._layer = self.temporary.with_suffix(".usdc") if packed else self.temporary
+        with self.all_or_nothing(), writing(path):
+            self._begin()
+
+    def _begin(self) -> None:
         from pxr import Usd, UsdGeom
 
-        self.apart = trajectory.step * slowdown * fps
-        self.frames, self.pending, self.slowdown, self.velocities = 0, 0, slowdown, velocities
-        self.stage = stage = Usd.Stage.CreateNew(str(path))
+        slowdown, fps = self.look["slowdown"], self.look["fps"]
+        self.stage = stage = Usd.Stage.CreateNew(str(self._layer))
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
         stage.SetTimeCodesPerSecond(fps)
@@ -166,26 +212,25 @@ class UsdFrames:
         stage.SetStartTimeCode(0)
         layer = stage.GetRootLayer()
         layer.comment = f"One second of simulated time takes {slowdown:g} s to play, at {fps:g} time codes a second."
-        layer.customLayerData = {"slowdown": slowdown, "step": trajectory.step}
+        layer.customLayerData = {"slowdown": slowdown, "step": self.head.step}
         self.cloth = UsdGeom.Xform.Define(stage, "/cloth")
         stage.SetDefaultPrim(self.cloth.GetPrim())
-        self.weaving = Weaving(trajectory.cloth, selvedge=selvedge)
-        # a selvedge's yarns run on in each other, and so have no u and v of their own
-        self.slides = not selvedge and (trajectory.scene is None or trajectory.scene.sliding)
-        self.shapes: list[Shape] = [self._yarns(strands, tubes, sides) for strands in self.weaving.strands]
-        if surface:
+        self.shapes: list[Shape] = [self._yarns(strands) for strands in self.weaving.strands]
+        if self.look["surface"]:
             self.shapes.append(Surface(stage, self.weaving))
-        self._translate: UsdGeom.XformOp | None = None
-        self._origin: tuple[np.ndarray, float] | None = None
-        if obstacles:
-            UsdGeom.Scope.Define(stage, "/obstacles")
-            grey = material(stage, "/obstacles/materials/grey", OBSTACLE_COLOR)
-            for k, each in enumerate(obstacles):
-                shape = write_obstacle(stage, f"/obstacles/{each.obstacle.shape}_{k}", each, self.apart)
-                bind(shape, grey)
 
-    def add(self, position: np.ndarray, velocity: np.ndarray, euler: np.ndarray, origin: np.ndarray) -> None:
-        """Writes a frame.
+    def _size(self, points: int) -> int:
+        """Counts the bytes that so many points take in a frame."""
+        return 4 * points * (3 * (1 + bool(self.look["velocities"])) + self.slides)
+
+    def add(self, state: State) -> None:
+        low, high = bounds(state.position[None])
+        [origin] = _origins(low, high, self.weaving.cloth)
+        self._boxes.append(np.where(CORNERS, high, low))
+        self.write(state.position, state.velocity, state.euler, origin)
+
+    def write(self, position: np.ndarray, velocity: np.ndarray, euler: np.ndarray, origin: np.ndarray) -> None:
+        """Adds a frame, and saves where there is much to save.
 
         Args:
             position: [nodes, 3] (m).
@@ -193,32 +238,62 @@ class UsdFrames:
             euler: (u, v) [nodes, 2] (m).
             origin: what points are written from [3] (m).
         """
-        # whole where it is but for rounding, for programs that look at whole ones
-        time = round(self.frames * self.apart, 9)
-        self._place(origin, time)
-        looks = [self.weaving.look(position)]
-        speed = float(np.abs(velocity).max())
-        if self.velocities:
-            # a ten thousandth of a yarn there and back: all that a point depends on is smooth over that
-            ahead = 1e-4 * self.weaving.strands[0].half.max() / max(speed, np.finfo(float).tiny)
-            looks += [self.weaving.look(position + way * ahead * velocity) for way in (1.0, -1.0) if speed > 0.0]
-        for shape in self.shapes:
-            points, *moved = [shape.points(*look) for look in looks]
-            self.pending += 2 * points.nbytes
-            write_points(shape.prim, time, points - origin, shape.margin)
-            if self.velocities:
-                rate = (moved[0] - moved[1]) / (2.0 * ahead * self.slowdown) if moved else np.zeros_like(points)
-                shape.prim.GetVelocitiesAttr().Set(vectors(rate), time)
-            shape.slide(euler, time if self.slides else None)
-        self.frames += 1
-        self.stage.SetEndTimeCode(time)
-        if self.pending > PENDING:
-            self.pending = 0
-            self.stage.Save()
+        with writing(self.path):
+            # whole where it is but for rounding, for programs that look at whole ones
+            time = round(self.length * self.apart, 9)
+            self._place(origin, time)
+            looks = [self.weaving.look(position)]
+            speed = float(np.abs(velocity).max())
+            if self.look["velocities"]:
+                # a ten thousandth of a yarn there and back: all that a point depends on is smooth over that
+                ahead = 1e-4 * self.weaving.strands[0].half.max() / max(speed, np.finfo(float).tiny)
+                looks += [self.weaving.look(position + way * ahead * velocity) for way in (1.0, -1.0) if speed > 0.0]
+            for shape in self.shapes:
+                points, *moved = [shape.points(*look) for look in looks]
+                self._unsaved += self._size(len(points))
+                write_points(shape.prim, time, points - origin, shape.margin)
+                if self.look["velocities"]:
+                    twice = 2.0 * ahead * self.look["slowdown"]
+                    rate = (moved[0] - moved[1]) / twice if moved else np.zeros_like(points)
+                    shape.prim.GetVelocitiesAttr().Set(vectors(rate), time)
+                shape.slide(euler, time if self.slides else None)
+        self.length += 1
+        if self._unsaved > SAVE_BYTES and self._layer.suffix != ".usda":
+            self._save()
 
-    def close(self) -> None:
-        """Writes what is left."""
-        self.stage.Save()
+    def _save(self) -> None:
+        """Saves what is not."""
+        if self.whole is None:
+            self.needs(self._unsaved)
+        with writing(self.path):
+            self.stage.Save()
+        self._unsaved = 0
+
+    def close(self, end: End | None) -> None:
+        from pxr import UsdGeom
+
+        self.stage.SetEndTimeCode(round((self.length - 1) * self.apart, 9))
+        frames = self.whole or dataclasses.replace(self.head, position=np.array(self._boxes))
+        with writing(self.path):
+            for k, each in enumerate(placed(frames)):
+                UsdGeom.Scope.Define(self.stage, "/obstacles")
+                grey = material(self.stage, "/obstacles/materials/grey", OBSTACLE_COLOR)
+                path = f"/obstacles/{each.obstacle.shape}_{k}"
+                bind(write_obstacle(self.stage, path, each, self.apart), grey)
+        self._save()
+        # no stage may hold the file when it is moved: Windows would not move it
+        self.drop()
+        if self._layer != self.temporary:
+            self.needs(self._layer.stat().st_size)
+            pack(self._layer, self.temporary)
+
+    def drop(self) -> None:
+        self.cloth = self.stage = self._translate = None
+        self.shapes = []
+
+    def finish(self, end: End | None) -> None:
+        super().finish(end)
+        reload(self.path)
 
     def _place(self, origin: np.ndarray, time: float) -> None:
         """Moves /cloth to where points are written from: once, or at every frame since that began to move."""
@@ -238,11 +313,15 @@ class UsdFrames:
                 self._translate.Set(Gf.Vec3d(*before[0].tolist()), before[1])
             self._translate.Set(Gf.Vec3d(*origin.tolist()), time)
 
-    def _yarns(self, strands: Strands, tubes: bool, sides: int) -> Curves | TubeMesh:
+    def _yarns(self, strands: Strands) -> Curves | TubeMesh:
         look = material(self.stage, f"/cloth/materials/yarn_{strands.material}", strands.color)
         path = f"/cloth/yarn_{strands.material}"
         rest = self.weaving.cloth.euler
-        shape = TubeMesh(self.stage, path, strands, rest, sides) if tubes else Curves(self.stage, path, strands, rest)
+        shape: Curves | TubeMesh
+        if self.look["tubes"]:
+            shape = TubeMesh(self.stage, path, strands, rest, self.look["sides"])
+        else:
+            shape = Curves(self.stage, path, strands, rest)
         bind(shape.prim, look)
         shape.prim.CreateDisplayColorPrimvar("constant").Set([linear(strands.color)])
         return shape
@@ -251,11 +330,19 @@ class UsdFrames:
 def origins(trajectory: Trajectory) -> np.ndarray:
     """Finds where points are counted from at each frame [frames, 3] (m): the origin; or, where single precision would
     move them by more than ``COARSE`` radii, the middle of the cloth, at all frames or at each."""
-    position = trajectory.position
-    low, high = position.min(axis=1), position.max(axis=1)
-    reach = COARSE * float(trajectory.cloth.halves.min()) / np.finfo(np.float32).epsneg
+    return _origins(*bounds(trajectory.position), trajectory.cloth)
+
+
+def _origins(low: np.ndarray, high: np.ndarray, cloth: Cloth | Cloths) -> np.ndarray:
+    reach = COARSE * float(cloth.halves.min()) / np.finfo(np.float32).epsneg
     middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
     for origin in (np.zeros(3), middle):
         if max(np.abs(low - origin).max(), np.abs(high - origin).max()) <= reach:
-            return np.broadcast_to(origin, (len(position), 3))
+            return np.broadcast_to(origin, (len(low), 3))
     return 0.5 * (low + high)
+
+
+def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the lowest and the highest coordinates [..., 3] of points [..., points, 3]."""
+    rows = np.ascontiguousarray(points.swapaxes(-1, -2))  # in which NumPy looks for them many times as fast
+    return rows.min(axis=-1), rows.max(axis=-1)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,8 +12,9 @@ import warp as wp
 from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.obstacles import Obstacle, TriangleMesh
+from ..device import start
 from ..device.exclusive import ALONE, compiling, refuse_recording
-from ..errors import InputError, finite_array
+from ..errors import InputError, brief, finite_array
 from ..kernels import Variant, build
 from ..simulation.state import Trajectory
 
@@ -84,15 +87,15 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
     """Lists the obstacles of a trajectory's scene.
 
     Args:
-        at: when its frames are, in steps since the first frame of the run [frames], which need not be whole; None: 0,
-            1, 2, ...
+        at: when its frames are, in frames since the first of the run [frames], which need not be whole; None: 0, 1, 2,
+            ...
     """
     if trajectory.scene is None:
         return []
     at = np.arange(len(trajectory)) if at is None else np.asarray(at)
     result = []
     for obstacle in trajectory.scene.obstacles:
-        position, rotation = _poses(obstacle, trajectory.start + at)
+        position, rotation = _poses(obstacle, trajectory.start + trajectory.every * at)
         width = length = 0.0
         if obstacle.shape == "plane":
             # a rectangle of its own, which moves as it does, under all of the cloth at all times
@@ -146,25 +149,31 @@ def _turned(q: np.ndarray, points: np.ndarray) -> np.ndarray:
 def checked(trajectory: Trajectory) -> np.ndarray:
     """Gives the positions of a trajectory that can be drawn [frames, nodes, 3] (m), or an InputError."""
     if not isinstance(trajectory, Trajectory):
-        raise InputError(f"trajectory = {trajectory!r}, must be a Trajectory, such as Simulator.run returns")
+        raise InputError(f"trajectory = {brief(trajectory)}, must be a Trajectory, such as Simulator.run returns")
     position = finite_array("trajectory.position", trajectory.position, (None, trajectory.cloth.nodes, 3))
     if not len(position):
         raise InputError("trajectory has no frame, must have at least one")
     return position
 
 
+_CROSSINGS: weakref.WeakKeyDictionary[Cloth | Cloths, list[Any]] = weakref.WeakKeyDictionary()
+"""Of cloths that were drawn, on the device: arguments of the kernel that finds normals, for which a film asks at every
+frame."""
+
+
 def contact_normals(cloth: Cloth | Cloths, position: np.ndarray) -> np.ndarray:
     """Computes unit normals from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
-    topology, device = cloth.topology, wp.get_device("cpu")
+    device = start.device("cpu")
     with ALONE, compiling():
         refuse_recording(device)
         kernel = build(Variant(wp.float64, True))["contact_normal"]
+        if cloth not in _CROSSINGS:
+            topology = cloth.topology
+            kinds = {"crossing_node": int, "crossing_neighbours": wp.vec4i, "flipped": int}
+            _CROSSINGS[cloth] = [wp.array(getattr(topology, k), dtype=kind, device=device) for k, kind in kinds.items()]
         positions = wp.array(position, dtype=wp.vec3d, device=device)
         normals = wp.zeros_like(positions)
-        crossings = wp.array(topology.crossing_node, dtype=int, device=device)
-        neighbours = wp.array(topology.crossing_neighbours, dtype=wp.vec4i, device=device)
-        flipped = wp.array(topology.flipped, dtype=int, device=device)
+        dim = len(_CROSSINGS[cloth][0])
         for frame in range(len(position)):
-            inputs = [crossings, neighbours, flipped, positions[frame], normals[frame]]
-            wp.launch(kernel, dim=len(crossings), inputs=inputs, device=device)
+            wp.launch(kernel, dim=dim, inputs=[*_CROSSINGS[cloth], positions[frame], normals[frame]], device=device)
         return normals.numpy()

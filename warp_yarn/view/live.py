@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, SimulationError, integer
+from ..errors import InputError, SimulationError, brief, integer, missing_extra
 from ..simulation.state import Trajectory
 from .camera import VIEW, Camera
 from .geometry import OBSTACLE_COLOR, placed
@@ -33,7 +33,7 @@ def view(simulator: Simulator, *, port: int = 8080, host: str = "127.0.0.1") -> 
     """Shows a simulation in the browser, at http://host:port, with its energies: it is played, stepped, reset, and
     simulated on without some of its terms, from there or by the viewer that this returns.
 
-    Needs ``warp_yarn[view]``. The simulation runs in a thread of its own until the viewer is closed, or the program
+    Needs the extra ``view``. The simulation runs in a thread of its own until the viewer is closed, or the program
     ends: ``wy.view(simulator).wait()`` keeps a script alive until Ctrl-C.
 
     Args:
@@ -46,7 +46,7 @@ def view(simulator: Simulator, *, port: int = 8080, host: str = "127.0.0.1") -> 
     """
     port = integer("port", port, least=1, most=65535)
     if not hasattr(simulator, "scene") or not callable(getattr(simulator, "run", None)):
-        raise InputError(f"simulator = {simulator!r}, must be a Simulator")
+        raise InputError(f"simulator = {brief(simulator)}, must be a Simulator")
     return Viewer(simulator, _viser(), port, host)
 
 
@@ -325,4 +325,4 @@ def _viser() -> types.ModuleType:
     try:
         return importlib.import_module("viser")
     except ImportError as error:
-        raise InputError("viser is not installed, which viewing needs: pip install warp_yarn[view]") from error
+        raise missing_extra("viser", "viewing needs", "view") from error

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from ..errors import InputError, integer, real
+from ..errors import InputError, integer, missing_extra, real
 from ..io.files import atomic_write
 from ..simulation.state import Trajectory
 from . import raster
@@ -49,7 +49,7 @@ def write_png(
     plane a rectangle beneath the cloth.
 
     Yarns are woven to the very edge, where free ends stick out by a fraction of a spacing that no simulation knows of.
-    Needs ``warp_yarn[render]``. The same picture is the same to the last pixel. The file appears whole or not at all.
+    Needs the extra ``render``. The same picture is the same to the last pixel. The file appears whole or not at all.
 
     Args:
         path: of the picture, ending in .png.
@@ -92,7 +92,7 @@ def write_mp4(
     """Draws a trajectory as a movie (H.264), seen by a camera that stands still.
 
     Picture k shows time k / (frames_per_second · slowdown); between two frames of the trajectory every node is taken
-    to move along a straight line, and every obstacle to move and turn steadily. Needs ``warp_yarn[render]``. The file
+    to move along a straight line, and every obstacle to move and turn steadily. Needs the extra ``render``. The file
     appears whole or not at all.
 
     Args:
@@ -124,6 +124,16 @@ def write_mp4(
         with writer:
             for frame in tqdm.trange(len(at), desc="drawing", unit="picture", disable=disable):
                 writer.append_data(scene.drawn(frame))
+
+
+def check_drawing(*, movies: bool = False) -> None:
+    """Finds out whether pictures, or movies too, can be drawn, before there is anything to draw.
+
+    Raises:
+        InputError: an extra is not installed.
+    """
+    for module in ("imageio.v2", "imageio_ffmpeg")[: 1 + movies]:
+        _extra(module)
 
 
 def steady_camera(trajectory: Trajectory, *, size: Sequence[int] = (1280, 960), view: Sequence[float] = VIEW) -> Camera:
@@ -255,5 +265,4 @@ def _extra(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        name = module.partition(".")[0]
-        raise InputError(f"{name} is not installed, which pictures need: pip install warp_yarn[render]") from error
+        raise missing_extra(module.partition(".")[0], "pictures need", "render") from error
