@@ -18,9 +18,9 @@ import warp as wp
 import warp_yarn as wy
 from warp_yarn.description.weave import woven
 from warp_yarn.errors import integer, missing_extra, real
-from warp_yarn.io import recordings
 from warp_yarn.io.draft import ENDINGS
 from warp_yarn.io.files import check_writable
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.presets.fabrics import FABRICS
 from warp_yarn.simulation.pace import ROUNDING
 from warp_yarn.view.render import check_drawing
@@ -130,7 +130,7 @@ def simulate(
     given = [path for path in files if path is not None]
     with tempfile.TemporaryDirectory(prefix="warp_yarn-", ignore_cleanup_errors=True) as folder:
         # what is looked at afterwards, pictures among it, is read from a recording
-        kept = next((path for path in given if path.suffix in recordings.ENDINGS), Path(folder) / "frames.npz")
+        kept = next((path for path in given if path.suffix in RECORDINGS), Path(folder) / "frames.npz")
         paths = given if kept in given else [*given, kept]
         try:
             simulator.record(

@@ -33,7 +33,7 @@ from common import (
 )
 
 import warp_yarn as wy
-from warp_yarn.io import recordings
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -67,9 +67,9 @@ def parser() -> argparse.ArgumentParser:
     add("--png", type=file_ending(".png"), metavar="FILE", help="a picture of the last frame")
     add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
     text = "the frames as numbers (.npz, .h5), for --resume and wy.Trajectory.load"
-    add("--record", type=file_ending(*recordings.ENDINGS), metavar="FILE", help=text)
+    add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     text = "go on from the end of a recording, at its frames a second"
-    add("--resume", type=file_ending(*recordings.ENDINGS), metavar="FILE", help=text)
+    add("--resume", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     return result
 
 

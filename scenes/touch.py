@@ -24,7 +24,7 @@ from common import (
 )
 
 import warp_yarn as wy
-from warp_yarn.io import recordings
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -56,7 +56,7 @@ def parser(text: str | None, name: str, *, rows: int, columns: int, steps: int) 
     add("--png", type=file_ending(".png"), metavar="FILE", help="a picture of the last frame")
     add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
     text = "the frames as numbers (.npz, .h5), for wy.Trajectory.load"
-    add("--record", type=file_ending(*recordings.ENDINGS), metavar="FILE", help=text)
+    add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     return result
 
 

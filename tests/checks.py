@@ -40,6 +40,7 @@ def natural(c: wy.Cloth, term: str) -> float:
         "parallel": c.parallel_stiffness * length**2,
         "wind": WIND.density * length**2 * 25.0,
         "pins": 1e4 * length,
+        "seams": 2e3 * length,
         "friction": np.max(c.friction_stiffness) * 1e-5,
         "applied": 1e-4,
         "inertia": density * SPEED**2,

@@ -20,7 +20,7 @@ import warp_yarn as wy
 RIGHT = 0.5 * math.pi
 TERMS = (
     "inertia", "mass_rate", "stretch", "crimp_interchange", "bending", "gravity", "parallel", "shear", "wind", "pins",
-    "applied", "friction",
+    "applied", "friction", "seams",
 )  # fmt: skip
 
 Tensor = torch.Tensor
@@ -81,6 +81,11 @@ def parallel(q: Tensor, k: Tensor, distance: Tensor, guard: Tensor, reach: Tenso
 
 def pin(q: Tensor, k: Tensor, target: Tensor) -> Tensor:
     return 0.5 * k * (q - target) @ (q - target)
+
+
+def seam(q: Tensor, k: Tensor) -> Tensor:
+    """q = (x_a, x_b)"""
+    return 0.5 * k * (q[3:6] - q[0:3]) @ (q[3:6] - q[0:3])
 
 
 def angle(t1: Tensor, t2: Tensor) -> Tensor:
@@ -399,6 +404,9 @@ class Oracle:
         self.pins = Elements(
             torch.tensor([self.unknowns(node) for node in nodes]), pin, (k, tensor(cloth.position[nodes]))
         )
+        sewn = [[int(node) for node in pair] for pair in scene.seams]
+        k = tensor([scene.seam_stiffness] * len(sewn))
+        self.seams = Elements(torch.tensor([self.unknowns(*pair) for pair in sewn]), seam, (k,))
 
     def woven(self, a: tuple[int, int], b: tuple[int, int]) -> list[float]:
         """Distance of two crossings (j, i), and length of the yarn between them, as woven."""

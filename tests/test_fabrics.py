@@ -2,13 +2,14 @@
 
 import functools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import warp_yarn as wy
 from warp_yarn.presets.fabrics import FABRICS, NAMED
-from warp_yarn.presets.named import KINDS, UNITS, Datum, NamedFabric
+from warp_yarn.presets.named import KINDS, UNITS, Datum, NamedFabric, tables
 
 GF = 9.80665e-3
 """N: the force of the textile laboratories' units."""
@@ -279,6 +280,11 @@ def test_every_number_has_its_source(name):
     assert (cloth.shear, cloth.friction) == (value(name, "modulus"), value(name, "friction"))
     assert cloth.weave.name == value(name, "weave")
     assert [*cloth.warp, *cloth.weft] == [0] * 17 + [1] * 17
+
+
+def test_the_page_has_these_numbers():
+    page = (Path(__file__).parents[1] / "docs" / "fabrics.md").read_text()
+    assert page.endswith(f"{tables(NAMED)}\n")
 
 
 def test_pieces_by_size():

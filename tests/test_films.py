@@ -18,6 +18,7 @@ from pxr import Usd, UsdGeom
 import warp_yarn as wy
 from warp_yarn.calibration.learn import CalibrationProblem, Parameter
 from warp_yarn.io import files, recordings, usd
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.simulation.state import FIELDS
 from warp_yarn.view import geometry
 
@@ -359,7 +360,7 @@ def test_memory_does_not_grow_with_the_frames(tmp_path):
 
 def recorded(path: Path) -> int:
     """Frames of a file, each of which is whole."""
-    if path.suffix in recordings.ENDINGS:
+    if path.suffix in RECORDINGS:
         return len(wy.Trajectory.load(path))
     stage = Usd.Stage.Open(str(path))
     shape = UsdGeom.PointBased(stage.GetPrimAtPath("/cloth/yarn_0"))

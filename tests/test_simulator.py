@@ -302,7 +302,7 @@ DAMAGES = {
     "frames": ({"anchor": np.zeros((3, 16, 2))}, r"anchor has shape \(3, 16, 2\)"),
     "no frame": ({"position": np.zeros((0, 16, 3))}, "has no frame"),
     "not finite": ({"position": np.full((4, 16, 3), np.inf)}, r"position\[0, 0, 0\] is inf"),
-    "newer": ({"format": 99}, "format = 99, this warp_yarn reads up to 5"),
+    "newer": ({"format": 99}, "format = 99, this warp_yarn reads up to 6"),
     "start": ({"start": -1}, "start = -1, must be finite and at least 0"),
     "density": ({"yarns": np.full((2, 3), -1.0)}, r"density = -1\.0"),
     "missing": ({"draft": None}, "not a recording of warp_yarn"),

@@ -5,16 +5,26 @@ import importlib.metadata
 from types import ModuleType
 
 from . import moved, view
+from .description import outline
 from .description.cloth import Cloth
 from .description.cloths import Cloths
 from .description.crimp import crimp_height
 from .description.draft import Draft
 from .description.fibre import FIBRES, Fibre
 from .description.obstacles import Box, Capsule, Contact, Cylinder, Plane, Sphere, TriangleMesh
+from .description.pieces import piece
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
-from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError, missing_extra
+from .errors import (
+    GradientError,
+    InputError,
+    NoAttributeError,
+    SimulationError,
+    WarpYarnError,
+    WarpYarnWarning,
+    missing_extra,
+)
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
 from .io.draft import read_draft, write_draft
@@ -61,13 +71,16 @@ __all__ = [
     "TriangleMesh",
     "Variant",
     "WarpYarnError",
+    "WarpYarnWarning",
     "Weave",
     "Wind",
     "Yarn",
     "__version__",
     "crimp_height",
     "fabrics",
+    "outline",
     "paper",
+    "piece",
     "read_draft",
     "read_published",
     "register_integrator",

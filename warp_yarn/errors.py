@@ -46,6 +46,10 @@ class SimulationError(WarpYarnError, RuntimeError):
         return functools.partial(type(self), **numbers), self.args, self.__dict__
 
 
+class WarpYarnWarning(UserWarning):
+    """What can be used and is likely not meant: a number in another unit, or a reading that pins turn."""
+
+
 class GradientError(WarpYarnError, RuntimeError):
     """A gradient that could not be computed.
 

@@ -6,8 +6,10 @@ from typing import Any
 
 import warp as wp
 
-ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "pins", "applied", "node_obstacles")
-"""What a term's kernel may run over."""
+ELEMENTS = (
+    "nodes", "crossings", "segments", "bends", "triangles", "seams", "pins", "applied", "samples", "sample_obstacles"
+)  # fmt: skip
+"""What a term's kernel may run over. Samples are what touches: nodes, or points between them too."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +133,7 @@ class Term:
     """Says why a scene has no use for the term, or "" where it has. None: every scene has."""
     stencil: int = 0
     """Neighbours that the term couples in the matrix: 0 none, 2 the next crossings of each yarn, 4 the second
-    next as well, 6 the diagonal ones as well."""
+    next as well, 6 the diagonal ones as well, 8 what is sewn together."""
     needs_contact: bool = False
     """Whether the term reads the contact force of every crossing."""
     touches: bool = False

@@ -3,7 +3,8 @@
 The matrix is symmetric, so each node keeps its own blocks and those of its upper neighbours only, in fixed slots:
 0 and 1 the next crossing of its warp and weft yarn, 2 and 3 the second next, 4 and 5 the diagonal ones. The first
 four slots carry sliding blocks of the yarn's own coordinate too (slot mod 2 is its direction); a diagonal neighbour
-couples positions alone. A slot that a scene's terms do not fill is not stored (``stencil`` is 2, 4 or 6 wide).
+couples positions alone. A slot that a scene's terms do not fill is not stored (``stencil`` is 2, 4 or 6 wide; 8 where
+nodes are sewn together, in slots 6 and 7).
 
     diagonal_xx [node]        3 × 3    upper_xx [stencil·node + slot]  3 × 3   row x of node, column x of neighbour
     diagonal_xs [2·node + d]  3        upper_xs [4·node + slot]        3       row x of node, column s of neighbour

@@ -31,8 +31,9 @@ class Parameter:
         name: "density[k]", "stretch[k]", "bend[k]" of material k; a number of the cloth, such as "shear" or "friction",
             with the place in the flattened array where the cloth has more than one ("shear[1]" of warp yarns of
             material 0 and weft yarns of material 1; "friction[7]" of node 7);
-            "wind_velocity[k]", "wind_density", "wind_drag", "gravity[k]" or "pin_stiffness", where the scene has them;
-            a parameter of a registered term of the scene, with an index where it is a vector or the yarns'.
+            "wind_velocity[k]", "wind_density", "wind_drag", "gravity[k]", "pin_stiffness" or "seam_stiffness", where
+            the scene has them; a parameter of a registered term of the scene, with an index where it is a vector or the
+            yarns'.
         low, high: the range, its ends included; low below high.
         start: where learning begins, in the range.
     """
@@ -79,11 +80,15 @@ def learnable(scene: Scene) -> dict[str, int | None]:
         value = getattr(scene.cloth, name)
         result[name] = value.size if np.ndim(value) else None
     if scene.wind is not None:
-        result |= {"wind_velocity": 3, "wind_density": None, "wind_drag": None}
-    if scene.gravity is not None:
+        result |= {"wind_density": None, "wind_drag": None}
+        if np.shape(scene.wind.velocity) == (3,):
+            result["wind_velocity"] = 3
+    if scene.gravity is not None and np.shape(scene.gravity) == (3,):
         result["gravity"] = 3
     if len(scene.pins) and scene.pin_stiffness is not None:
         result["pin_stiffness"] = None
+    if len(scene.seams):
+        result["seam_stiffness"] = None
     for name, parameter in scene.registered.items():
         result[name] = len(scene.cloth.yarns) if parameter.of == "yarn" else 3 if parameter.size == 3 else None
     return result
@@ -132,13 +137,16 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
             numbers[name].flat[k] = value
     changes["cloth"] = old.replace(yarns=yarns, pose=old.position, **numbers)
     if scene.wind is not None:
-        velocity: Any = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
+        velocity: Any = scene.wind.velocity
+        if np.shape(velocity) == (3,):
+            velocity = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(velocity))
         rest = {OF_WINDS[name]: parts[name, None] for name in ("wind_density", "wind_drag") if (name, None) in parts}
         changes["wind"] = dataclasses.replace(scene.wind, velocity=velocity, **rest)
-    if scene.gravity is not None:
+    if scene.gravity is not None and np.shape(scene.gravity) == (3,):
         changes["gravity"] = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
-    if ("pin_stiffness", None) in parts:
-        changes["pin_stiffness"] = parts["pin_stiffness", None]
+    for name in ("pin_stiffness", "seam_stiffness"):
+        if (name, None) in parts:
+            changes[name] = parts[name, None]
     changes["parameters"] = scene.parameters
     for (name, k), value in parts.items():
         if name in scene.registered:

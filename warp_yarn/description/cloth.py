@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, choice, finite_array, real
+from .cutting import Cut, cut
+from .outline import checked_outline
+from .places import Places
+from .sanity import warn_of_units
 from .topology import Topology, rectangle
 from .weave import Weave
 from .woven import (
     OF_CROSSINGS,
     Each,
     Numbers,
-    Woven,
     check_room,
     checked_crimp,
     checked_materials,
@@ -40,11 +43,11 @@ CLOTH_NUMBERS = (
 POSES = ("upright", "flat")
 
 
-class Cloth(Woven):
-    """A rectangle of woven cloth at rest.
+class Cloth(Places):
+    """A rectangle of woven cloth at rest, or what is cut out of one.
 
-    Node (row j, column i) has index i + j·columns. Warp yarn j runs through row j, along u; weft yarn i through
-    column i, along v. Where all yarns are equally far apart, (u, v) = (i L, j L) at rest.
+    Node (row j, column i) of a rectangle has index i + j·columns. Warp yarn j runs through row j, along u; weft yarn i
+    through column i, along v. Where all yarns are equally far apart, (u, v) = (i L, j L) at rest.
 
     Args:
         weave: the draft.
@@ -70,6 +73,9 @@ class Cloth(Woven):
         parallel_stiffness: k_c, repulsion of parallel yarns [N/m], at least 0.
         pose: "upright", (x, 0, height − y) of a node x along u and y along v from the first one; "flat", (x, y, 0); or
             positions, nodes × 3 [m].
+        outline: what is cut out of the rectangle: the corners of a polygon (u, v) [n, 2] (m), in its plane at rest,
+            (0, 0) being its first node; None: all of it. See ``cut``.
+        holes: polygons that are cut out of that, apart from it and from each other.
     """
 
     def __init__(
@@ -89,6 +95,8 @@ class Cloth(Woven):
         friction_sharpness: float = 10.0,
         parallel_stiffness: float = 1.0,
         pose: Any = "upright",
+        outline: Any = None,
+        holes: Sequence[Any] = (),
     ):
         if not isinstance(weave, Weave):
             raise InputError(f"weave = {weave!r}, must be a Weave, such as Weave.plain(rows=17, columns=17)")
@@ -103,7 +111,7 @@ class Cloth(Woven):
         self.spacing = checked_spacing(spacing, weave.rows, weave.columns)
         self.radius = real("radius", radius, above=0.0)
         self.crimp = checked_crimp(crimp, weave.rows, weave.columns)
-        self._measure()
+        self._measure(outline, holes)
         self.shear = self._of_crossings("shear", shear)
         self.friction = self._of_crossings("friction", friction)
         self.friction_stiffness = self._of_crossings("friction_stiffness", friction_stiffness)
@@ -129,7 +137,10 @@ class Cloth(Woven):
             crimp=self.crimp,
             friction_damping=None if friction_damping is None else self.friction_damping,
             pose=pose if isinstance(pose, str) else self.position,
+            outline=self.outline,
+            holes=self.holes,
         )
+        warn_of_units(self)
 
     def __repr__(self) -> str:
         if isinstance(self.spacing, float):
@@ -145,21 +156,13 @@ class Cloth(Woven):
             and np.array_equal(self.weave.flipped, other.weave.flipped)
             and [dataclasses.replace(yarn, color=None) for yarn in self.yarns]
             == [dataclasses.replace(yarn, color=None) for yarn in other.yarns]
+            and np.array_equal(self.topology.segment_nodes, other.topology.segment_nodes)
             and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in arrays)
         )
 
-    @property
-    def nodes(self) -> int:
-        return self.weave.rows * self.weave.columns
-
     @functools.cached_property
     def topology(self) -> Topology:  # type: ignore[override]
-        return rectangle(self.weave)
-
-    @property
-    def material(self) -> np.ndarray:  # type: ignore[override]
-        """Material of every yarn, the warp yarns first [rows + columns]."""
-        return np.concatenate([self.warp, self.weft])
+        return rectangle(self.weave) if self._cut is None else self._cut.topology
 
     @property
     def stretch_stiffness(self) -> np.ndarray:
@@ -167,67 +170,50 @@ class Cloth(Woven):
         halves = np.array([yarn.halves(self.radius) for yarn in self.yarns])
         return np.array([yarn.stretch for yarn in self.yarns]) * np.pi * (halves[:, 0] * halves[:, 1])
 
-    def node(self, row: int, column: int) -> int:
-        """Gives the index of a node; negative rows and columns count from the end."""
-        rows, columns = self.weave.rows, self.weave.columns
-        if not (isinstance(row, int | np.integer) and isinstance(column, int | np.integer)):
-            raise InputError(f"node (row {row!r}, column {column!r}), must be two whole numbers")
-        if not -rows <= row < rows or not -columns <= column < columns:
-            raise InputError(f"node (row {row}, column {column}) is outside a cloth of {rows} × {columns}")
-        return int(column % columns + (row % rows) * columns)
-
-    @property
-    def columns(self) -> int:
-        """Nodes of a warp yarn, which threads divide among them."""
-        return self.weave.columns
-
-    def place(self, node: int) -> str:
-        """Tells where a node is, in words."""
-        row, column = divmod(int(node), self.weave.columns)
-        return f"row {row}, column {column}"
-
-    @property
-    def rest_place(self) -> np.ndarray:
-        """Where nodes are at rest along u and v [nodes, 2], by which arcs along the cloth are compared (m)."""
-        return self.rest_grid
-
-    def corners(self, which: str = "all") -> list[int]:
-        """Lists the nodes at the corners: "top" (row 0), "bottom" (the last row), or "all"."""
-        choice("which", which, ("top", "bottom", "all"))
-        top = [self.node(0, 0), self.node(0, -1)]
-        bottom = [self.node(-1, 0), self.node(-1, -1)]
-        return {"top": top, "bottom": bottom, "all": top + bottom}[which]
-
-    def _measure(self) -> None:
-        """Finds where nodes are at rest, sizes and crimps of yarns, and (u, v)."""
-        rows, columns = self.weave.rows, self.weave.columns
-        row, column = np.divmod(np.arange(self.nodes), columns)
+    def _measure(self, outline: Any, holes: Sequence[Any]) -> None:
+        """Finds the yarns, their sizes and crimps, where nodes are at rest, and (u, v)."""
+        rows = self.weave.rows
         halves = np.array([yarn.halves(self.radius) for yarn in self.yarns])
-        self.halves = halves[self.material]
-        if (self.halves == self.halves[0, 0]).all():
-            self.radius = float(self.halves[0, 0])
-        self.yarn_crimp = np.zeros(rows + columns)
-        if isinstance(self.spacing, float):
-            self.rest_grid = np.stack([column, row], axis=1) * self.spacing
-            if (self.halves == self.radius).all() and self.radius > 0.5 * self.spacing * (1.0 + 1e-12):
+        of_lines = halves[np.concatenate([self.warp, self.weft])]
+        if (of_lines == of_lines[0, 0]).all():
+            self.radius = float(of_lines[0, 0])
+            if isinstance(self.spacing, float) and self.radius > 0.5 * self.spacing * (1.0 + 1e-12):
                 raise InputError(
                     f"radius = {self.radius:g}, must be at most half the spacing ({0.5 * self.spacing:g}), or "
                     "neighbouring yarns overlap"
                 )
-            gaps: tuple[Numbers, Numbers] = self.spacing, self.spacing
+        gaps = (self.spacing, self.spacing) if isinstance(self.spacing, float) else self.spacing
+        check_room(gaps[0], of_lines[:rows, 0], "warp")
+        check_room(gaps[1], of_lines[rows:, 0], "weft")
+        lines = self.lines
+        self.size = float(lines[0][-1]), float(lines[1][-1])
+        self._cut: Cut | None = None
+        self.outline: np.ndarray | None = None
+        self.holes: tuple[np.ndarray, ...] = ()
+        yarn_line = np.arange(rows + self.weave.columns)
+        if outline is None:
+            if len(holes):
+                raise InputError("holes without an outline, must have one: [[0, 0], [u, 0], [u, v], [0, v]] of all")
+            row, column = np.divmod(np.arange(self.nodes), self.weave.columns)
+            self.rest_grid = np.stack([lines[0][column], lines[1][row]], axis=1)
         else:
-            gaps = self.spacing
-            v = np.append(0.0, np.cumsum(np.broadcast_to(gaps[0], rows - 1)))
-            u = np.append(0.0, np.cumsum(np.broadcast_to(gaps[1], columns - 1)))
-            self.rest_grid = np.stack([u[column], v[row]], axis=1)
-        check_room(gaps[0], self.halves[:rows, 0], "warp")
-        check_room(gaps[1], self.halves[rows:, 0], "weft")
-        crimp = self.crimp
+            self.outline, *several = checked_outline(outline, holes, self.size)
+            self.holes = tuple(several)
+            self._cut = cut(self.weave, lines, [self.outline, *several])
+            self.rest_grid = self._cut.at
+            yarn_line = self._cut.yarn_line + rows * self._cut.topology.yarn_direction
+            if self._cut.topology.is_end.any():
+                self.spacing = gaps  # a free end's is its own
+        self.material = np.concatenate([self.warp, self.weft])[yarn_line]
+        self.halves = of_lines[yarn_line]
+        self.yarn_crimp = np.zeros(len(yarn_line))
         self.euler = self.rest_grid
-        if crimp:
-            warp, weft = (crimp, crimp) if isinstance(crimp, float) else crimp
-            self.yarn_crimp = np.concatenate([np.broadcast_to(warp, rows), np.broadcast_to(weft, columns)])
-            self.euler = self.rest_grid * (1.0 + self.yarn_crimp[np.stack([row, rows + column], axis=1)])
+        if crimp := self.crimp:
+            each = (crimp, crimp) if isinstance(crimp, float) else crimp
+            of_all = [np.broadcast_to(each[0], rows), np.broadcast_to(each[1], self.weave.columns)]
+            self.yarn_crimp = np.concatenate(of_all)[yarn_line]
+            longer = np.append(1.0 + self.yarn_crimp, 1.0)  # the last of a node without such a yarn
+            self.euler = self.rest_grid * longer[self.node_yarns]
 
     def _of_crossings(self, name: str, value: Any) -> Numbers:
         return checked_of_crossings(name, value, self.nodes, len(self.yarns))
@@ -238,4 +224,4 @@ class Cloth(Woven):
         choice("pose", pose, POSES)
         u, v = self.rest_grid.T
         zero = np.zeros_like(u)
-        return np.stack([u, zero, v[-1] - v] if pose == "upright" else [u, v, zero], axis=1)
+        return np.stack([u, zero, v.max() - v] if pose == "upright" else [u, v, zero], axis=1)

@@ -110,13 +110,16 @@ class Cloths(Woven):
 
     def node(self, cloth: int, row: int, column: int) -> int:
         """Gives the index of a node of one of the cloths; negative rows and columns count from the end."""
+        return int(self.first_node[self._checked(cloth)]) + self.cloths[cloth].node(row, column)
+
+    def _checked(self, cloth: int) -> int:
         if not isinstance(cloth, int | np.integer) or not 0 <= cloth < len(self.cloths):
             raise InputError(f"cloth = {cloth!r}, must be from 0 to {len(self.cloths) - 1}")
-        return int(self.first_node[cloth]) + self.cloths[cloth].node(row, column)
+        return int(cloth)
 
     def nodes_of(self, cloth: int) -> slice:
         """Tells where the nodes of one of the cloths stand in arrays of nodes."""
-        first = self.node(cloth, 0, 0)
+        first = int(self.first_node[self._checked(cloth)])
         return slice(first, first + self.cloths[cloth].nodes)
 
     def place(self, node: int) -> str:

@@ -73,10 +73,10 @@ def levels(topology: Topology, stencil: int, free: np.ndarray) -> Levels:
 
     Args:
         topology: its index arrays.
-        stencil: how many upper neighbours of a node the matrix has: 2, 4 or 6.
+        stencil: how many upper neighbours of a node the matrix has: 2, 4, 6 or 8.
         free: [nodes] whether a node moves; what is held takes no part in any level.
     """
-    place = topology.node_yarns
+    place = topology.place
     near = topology.neighbour[:, :stencil]
     node, slot = np.nonzero(near >= 0)
     other = near[node, slot]
@@ -87,14 +87,14 @@ def levels(topology: Topology, stencil: int, free: np.ndarray) -> Levels:
     upper = topology.nodes + stencil * node + slot
     pairs = np.concatenate([[every, every, every], [node, other, upper], [other, node, ~upper]], axis=1)
 
-    starts, lines_of = [0], _lines(place)
+    starts, lines_of = [0], _yarns(topology)
     coarse_lines: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     parents, weights, children, parts = [], [], [], []
-    active = np.asarray(free, dtype=bool)
+    active, own = np.asarray(free, dtype=bool), topology.is_end == 0
     while len(place) > COARSEST:
         kept = [_kept(place[:, d]) for d in range(2)]
-        up, weight, coarse = _interpolation(place, kept)
-        if len(coarse) == len(place):
+        up, weight, coarse = _interpolation(place, kept, own)
+        if len(coarse) in (0, len(place)):
             break
         weight = weight * active[:, None]
         up = np.where(weight > 0.0, up, -1)
@@ -108,6 +108,7 @@ def levels(topology: Topology, stencil: int, free: np.ndarray) -> Levels:
         starts.append(first + len(coarse))
         pairs = _coarse_pairs(coarse, first)
         place, active = coarse, np.ones(len(coarse), dtype=bool)
+        own = active
         if len(place) > COARSEST:
             for found, line in zip(coarse_lines, _lines(place), strict=True):
                 found.extend(nodes + first for nodes in line)
@@ -139,12 +140,26 @@ def levels(topology: Topology, stencil: int, free: np.ndarray) -> Levels:
     )
 
 
+def _yarns(topology: Topology) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Lists the nodes of every warp yarn, and of every weft yarn, in their order; a node that one direction has no yarn
+    at is a line of its own there."""
+    result = []
+    for direction in range(2):
+        mine = topology.yarn_direction[topology.segment_yarn] == direction
+        yarn = len(topology.yarn_direction) + np.arange(topology.nodes)
+        yarn[topology.segment_nodes[mine]] = topology.segment_yarn[mine, None]
+        order = np.argsort(yarn, kind="stable")
+        result.append(np.split(order, np.flatnonzero(np.diff(yarn[order])) + 1))
+    return result[0], result[1]
+
+
 def _lines(place: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Lists the nodes of every warp yarn, and of every weft yarn, in their order."""
+    """Lists the coarse nodes of every warp yarn, and of every weft yarn, in their order, from gap to gap."""
     result = []
     for yarn, along in (place.T, place.T[::-1]):
         order = np.lexsort((along, yarn))
-        result.append(np.split(order, np.flatnonzero(np.diff(yarn[order])) + 1))
+        apart = (np.diff(yarn[order]) != 0) | (np.diff(along[order]) != 1)
+        result.append(np.split(order, np.flatnonzero(apart) + 1))
     return result[0], result[1]
 
 
@@ -156,16 +171,18 @@ def _kept(yarn: np.ndarray) -> np.ndarray:
     return np.unique(np.append(yarns[::2], yarns[-1]))
 
 
-def _interpolation(place: np.ndarray, kept: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _interpolation(
+    place: np.ndarray, kept: list[np.ndarray], own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Finds the parents [nodes, 4] and their weights, and the places of the coarse nodes [coarse, 2] by the kept yarns'
-    count."""
+    count. What does not have a place of its own has the parents of what is there, and moves with it."""
     sides = []
     for d in range(2):
         # the place of a yarn between those that are kept
         after = np.searchsorted(kept[d], place[:, d])
         exact = kept[d][after] == place[:, d]
         sides.append((np.where(exact, after, after - 1), after, np.where(exact, 1.0, 0.5), np.where(exact, 0.0, 0.5)))
-    stays = (sides[0][3] == 0.0) & (sides[1][3] == 0.0)
+    stays = own & (sides[0][3] == 0.0) & (sides[1][3] == 0.0)
     coarse = np.stack([sides[0][1], sides[1][1]], axis=1)[stays]
     order = np.lexsort((coarse[:, 1], coarse[:, 0]))
     coarse = coarse[order]
@@ -191,9 +208,13 @@ def _galerkin(
         for m in range(4):
             row, column = up[a, k], up[b, m]
             some = (row >= 0) & (column >= row)
-            row, column = row[some], column[some]
-            slot = slot_of[tuple((coarse[column] - coarse[row] + 2).T)]
-            found.append((BLOCKS * row + slot, source[some], weight[a[some], k] * weight[b[some], m]))
+            # what is sewn together may be anywhere: that has no part in the levels
+            apart = coarse[column * some] - coarse[row * some] + 2
+            some &= ((apart >= 0) & (apart < len(slot_of))).all(axis=1)
+            row, apart = row[some], apart[some]
+            found.append(
+                (BLOCKS * row + slot_of[tuple(apart.T)], source[some], weight[a[some], k] * weight[b[some], m])
+            )
     return tuple(np.concatenate(values) for values in zip(*found, strict=True))  # type: ignore[return-value]
 
 

@@ -1,7 +1,8 @@
 """Index arrays of a cloth: what the kernels run over.
 
-Kernels know nothing of rows and columns. Another kind of cloth (cut to an outline, several side by side) is another
-function that returns a Topology, with nodes numbered so that every yarn runs through increasing indices.
+Kernels know nothing of rows and columns. Another kind of cloth (cut to an outline: ``cutting.py``, several side by
+side) is another function that returns a Topology, with nodes numbered so that every yarn runs through increasing
+indices, and so that of a crossing's neighbours up comes before left, and right before down.
 """
 
 import dataclasses
@@ -29,13 +30,16 @@ class Topology:
     """[bends, 3]: three consecutive nodes a < c < b of one yarn."""
     bend_yarn: np.ndarray
     crossing_node: np.ndarray
-    """[crossings]: the nodes where yarns cross, that is all but the border."""
+    """[crossings]: the nodes where yarns cross, that is all but the border: those whose four neighbours are
+    places where yarns meet."""
     crossing_neighbours: np.ndarray
     """[crossings, 4]: left, right, up, down."""
     is_crossing: np.ndarray
     """[nodes]: 1 at a crossing."""
-    node_yarns: np.ndarray
-    """[nodes, 2]: the warp yarn of a node, counted among the warp yarns, and its weft yarn, among the weft yarns."""
+    is_end: np.ndarray
+    """[nodes]: 1 at the free end of a yarn that is cut between two others; no other yarn is there."""
+    place: np.ndarray
+    """[nodes, 2]: row and column in the weave, of a free end those of the node that it hangs at."""
     flipped: np.ndarray
     """[nodes]: the draft."""
     corner_jams: np.ndarray
@@ -45,7 +49,7 @@ class Topology:
     """[crossings, 4]: matrix blocks between the same two neighbours, in a stencil six wide. In the rows of up, left, up
     and right: nodes are numbered so that up comes before left and right, and these before down."""
     triangle_nodes: np.ndarray
-    """[triangles, 3]."""
+    """[triangles, 3]: none at free ends."""
     triangle_blocks: np.ndarray
     """[triangles, 3]: matrix blocks of its edges, in a stencil six wide."""
     neighbour: np.ndarray
@@ -57,7 +61,7 @@ def side_by_side(parts: Sequence[Topology]) -> Topology:
     nodes = np.cumsum([0, *(part.nodes for part in parts)])
     yarns = np.cumsum([0, *(len(part.yarn_direction) for part in parts)])
     # no place in the weave is that of two nodes
-    places = np.cumsum([[0, 0], *(part.node_yarns.max(axis=0) + 1 for part in parts)], axis=0)
+    places = np.cumsum([[0, 0], *(part.place.max(axis=0) + 1 for part in parts)], axis=0)
 
     def moved(name: str, by: np.ndarray) -> np.ndarray:
         values = [getattr(part, name) for part in parts]
@@ -71,11 +75,26 @@ def side_by_side(parts: Sequence[Topology]) -> Topology:
         ),
         **dict.fromkeys(("segment_yarn", "bend_yarn"), yarns),
         **dict.fromkeys(("corner_blocks", "triangle_blocks"), 6 * nodes),
-        **dict.fromkeys(("yarn_direction", "is_crossing", "flipped", "corner_jams"), still),
+        **dict.fromkeys(("yarn_direction", "is_crossing", "is_end", "flipped", "corner_jams"), still),
         "neighbour": nodes,
-        "node_yarns": places,
+        "place": places,
     }
     return Topology(nodes=int(nodes[-1]), **{name: moved(name, by) for name, by in offsets.items()})
+
+
+def blocks_between(nodes: np.ndarray, pairs: tuple[tuple[int, int], ...], neighbour: np.ndarray) -> np.ndarray:
+    """Finds the matrix blocks between two of the nodes of each element, in a stencil six wide [elements, pairs].
+
+    Args:
+        nodes: of every element [elements, nodes].
+        pairs: which two of them.
+        neighbour: as of the topology.
+    """
+    result = np.empty((len(nodes), len(pairs)), dtype=np.int32)
+    for k, (a, b) in enumerate(pairs):
+        low, high = np.minimum(nodes[:, a], nodes[:, b]), np.maximum(nodes[:, a], nodes[:, b])
+        result[:, k] = 6 * low + (neighbour[low] == high[:, None]).argmax(axis=1)
+    return result
 
 
 def rectangle(weave: Weave) -> Topology:
@@ -102,13 +121,6 @@ def rectangle(weave: Weave) -> Topology:
     neighbour[:-1, 1:, 5] = index[1:, :-1]
     neighbour = neighbour.reshape(-1, 6)
 
-    def blocks(nodes: np.ndarray, pairs: tuple[tuple[int, int], ...]) -> np.ndarray:
-        result = np.empty((len(nodes), len(pairs)), dtype=np.int32)
-        for k, (a, b) in enumerate(pairs):
-            low, high = np.minimum(nodes[:, a], nodes[:, b]), np.maximum(nodes[:, a], nodes[:, b])
-            result[:, k] = 6 * low + (neighbour[low] == high[:, None]).argmax(axis=1)
-        return result
-
     crossing = index[1:-1, 1:-1].ravel()
     left, right, up, down = crossing - 1, crossing + 1, crossing - columns, crossing + columns
     flipped = weave.flipped.astype(np.int32).ravel()
@@ -132,11 +144,12 @@ def rectangle(weave: Weave) -> Topology:
         crossing_node=crossing,
         crossing_neighbours=np.stack([left, right, up, down], axis=1),
         is_crossing=is_crossing,
-        node_yarns=np.stack([row.ravel(), column.ravel()], axis=1),
+        is_end=np.zeros(rows * columns, dtype=np.int32),
+        place=np.stack([row.ravel(), column.ravel()], axis=1),
         flipped=flipped,
         corner_jams=np.stack(jams, axis=1).astype(np.int32),
-        corner_blocks=np.concatenate([blocks(pair, ((0, 1),)) for pair in corners], axis=1),
+        corner_blocks=np.concatenate([blocks_between(pair, ((0, 1),), neighbour) for pair in corners], axis=1),
         triangle_nodes=triangle_nodes,
-        triangle_blocks=blocks(triangle_nodes, ((0, 1), (1, 2), (2, 0))),
+        triangle_blocks=blocks_between(triangle_nodes, ((0, 1), (1, 2), (2, 0)), neighbour),
         neighbour=neighbour,
     )

@@ -10,9 +10,10 @@ import numpy as np
 
 from ..errors import InputError, choice, integer
 from . import notation
+from .fixed import Fixed
 
 
-class Weave:
+class Weave(Fixed):
     """The draft of a cloth of rows × columns crossing nodes.
 
     The face of a cloth is the side where a flipped crossing has its warp yarn on top: z+ of a flat cloth, y+ of an
@@ -46,8 +47,8 @@ class Weave:
         self.draft.setflags(write=False)
         self.flipped = np.zeros_like(flipped)
         self.flipped[1:-1, 1:-1] = flipped[1:-1, 1:-1]
-        self.flipped.setflags(write=False)
         self.name = name
+        self._fix(draft=self.draft, name=name)
 
     @property
     def rows(self) -> int:

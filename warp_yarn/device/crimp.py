@@ -17,7 +17,9 @@ def set_arrays(arrays: Arrays) -> None:
     """Sets what crimp interchange, or a contact force at crimped positions, has; nothing where a scene has neither."""
     cloth = arrays.scene.cloth
     if "crimp interchange" in arrays.conditions:
-        for name, values in crimp.interchange(cloth).items():
+        found = crimp.interchange(cloth)
+        found["crimp_corners"] = arrays.blocks(found["crimp_corners"])
+        for name, values in found.items():
             dtype = arrays.declared[name].dtype(arrays.variant)
             arrays[name] = wp.array(np.ascontiguousarray(values), dtype=dtype, device=arrays.device)
     if "crimped contact" in arrays.conditions:

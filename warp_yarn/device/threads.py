@@ -47,8 +47,10 @@ class Threads:
                 f"threads = {asked}, must be 1 on {model.device} with the {model.preconditioner!r} preconditioner: "
                 "only the CPU's 'incomplete' and 'multilevel' ones share their work"
             )
-        if asked > 1 and isinstance(model.scene.cloth, Cloths):
-            raise InputError(f"threads = {asked} with several cloths, must be 1: threads share the columns of one")
+        cloth = model.scene.cloth
+        if asked > 1 and cloth.columns == cloth.nodes:
+            what = "several cloths" if isinstance(cloth, Cloths) else "a cloth that is cut"
+            raise InputError(f"threads = {asked} with {what}, must be 1: threads share the columns of a rectangle")
         self.count = max(1, min(asked, a["columns"] // NARROWEST))
         a.sizes |= {"thread": self.count, "signal": 16 + 16 * self.count}
         a.make(declarations.LINEAR_WORKSPACE)

@@ -14,6 +14,8 @@ from ..errors import InputError
 from ..simulation.state import End, State, Trajectory
 from .files import atomic_write, deferred, ended_by_exception, room
 
+RECORDINGS = (".npz", ".h5", ".hdf5")
+"""How the names of recordings end."""
 MARGIN = 1 << 17
 """Bytes of a file that no frame counts for: lists of what is where."""
 
@@ -187,6 +189,6 @@ def film(
     ending = Path(path).suffix
     if ending in usd.ENDINGS:
         return lambda: usd.Stage(path, head, look)
-    if ending in recordings.ENDINGS:
+    if ending in RECORDINGS:
         return lambda: recordings.recording(path, head, **written)
-    raise InputError(f"path = {str(path)!r}, must end in {', '.join((*usd.ENDINGS, *recordings.ENDINGS))}")
+    raise InputError(f"path = {str(path)!r}, must end in {', '.join((*usd.ENDINGS, *RECORDINGS))}")

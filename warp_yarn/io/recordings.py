@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import h5py
 
 HDF5 = (".h5", ".hdf5")
-ENDINGS = (".npz", *HDF5)
 BLOCK_BYTES = 4 << 20
 """Of frames that are kept until they are written together."""
 STILL = ("euler", "euler_velocity", "anchor")

@@ -82,8 +82,13 @@ def check_contact(scene: Scene, integrator: str) -> None:
         )
 
 
-def checked_chunk(chunk: int | None, nodes: int) -> int:
-    """Gives the steps to a chunk: kernels count its nodes in 31 bits, and its frames have to be in memory."""
+def checked_chunk(chunk: int | None, nodes: int, *, one: bool = False) -> int:
+    """Gives the steps to a chunk: kernels count its nodes in 31 bits, and its frames have to be in memory. It is one
+    where something is to be done before each step."""
+    if one and chunk not in (None, 1):
+        raise InputError(f"chunk = {chunk!r}, must be 1 or None with a hook or functions, which come before each step")
+    if one:
+        return 1
     if chunk is None:
         return min(64, max(1, CHUNK_BYTES // (FRAME_BYTES * nodes)))
     most = LARGEST // (2 * nodes) - 1

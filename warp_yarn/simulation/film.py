@@ -16,9 +16,10 @@ import tqdm
 from ..description.scene import Scene
 from ..errors import InputError
 from ..io.files import deferred
-from ..io.films import film, open_films
+from ..io.films import RECORDINGS, film, open_films
 from .alone import alone
 from .pace import Pace, every_of
+from .packing import warn_of_functions
 from .state import FIELDS, End, State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
@@ -86,7 +87,8 @@ class Filming:
         """Makes steps, and writes every frame to files as it comes, the present state first; memory holds a few.
 
         A file appears when the run ends, with the frames until then: at its end, and also after Ctrl-C, SIGTERM, a step
-        that fails, or where a disk is full. Recordings have what ``resumed`` needs, to the last bit.
+        that fails, or where a disk is full. Recordings have what ``resumed`` needs, to the last bit; but a scene with
+        functions is left out of them, with a WarpYarnWarning: no file holds them.
 
         Args:
             paths: of USD files (.usd, .usdc; .usda is kept in memory until its end, and .usdz then needs room for two)
@@ -118,8 +120,11 @@ class Filming:
         head.step, head.every = every * self.step_size, every
         pace = Pace.of(self.step_size, steps, seconds, every, 0 if earlier is None else earlier.count, gone)
         written = {"precision": precision, "compression": compression}
-        walk = Walk(self, pace, progress)
-        with open_films([film(path, head, written, shown) for path in paths]) as films:
+        walk, makers = Walk(self, pace, progress), [film(path, head, written, shown) for path in paths]
+        for path in paths:
+            if Path(path).suffix in RECORDINGS:
+                warn_of_functions(path, head.scene)
+        with open_films(makers) as films:
             if earlier is not None:
                 # an incomplete copy would take the place of the whole
                 films.wanted = False
@@ -148,7 +153,9 @@ class Filming:
         if not isinstance(recording, Trajectory):
             recording = Trajectory.load(recording, slice(-1, None))
         if recording.scene is None:
-            raise InputError("the recording has no scene to go on with: it is one of an older warp_yarn, or of another")
+            raise InputError(
+                "the recording has no scene to go on with: its scene had functions, or an older warp_yarn wrote it"
+            )
         made = {"step": recording.step / recording.every, **(recording.options or {}), **options}
         simulator: Any = cls(recording.scene, **made)  # type: ignore[call-arg]  # of the simulator, not of its base
         end = recording.end
@@ -253,7 +260,9 @@ class _Earlier:
         self.simulator = simulator
         head, scene = self.head, simulator.scene
         step = head.step / head.every
-        if head.scene is None or not head.scene.same_as(scene):
+        if head.scene is None:
+            raise InputError(f"after = {str(path)!r}: has no scene, such as one with functions, which no file holds")
+        if not head.scene.same_as(scene):
             raise InputError(f"after = {str(path)!r}: is of another scene")
         if abs(step - simulator.step_size) > 1e-12 * step:
             raise InputError(f"after = {str(path)!r}: has steps of {step:g} s, must be {simulator.step_size:g}")

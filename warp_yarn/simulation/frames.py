@@ -57,6 +57,10 @@ class Frames:
         self.arrays.add_frames(chunk + 1)
         self.recording: Recording | None = None
         self.options: dict[str, Any] | None = None
+        self.filled = 0
+        """Steps of the chunk on the device that lead to the present state."""
+        self.inputs_changed = False
+        """Whether the last step was made with other inputs than those that are in place."""
 
     def moves(self, name: str) -> bool:
         """Tells whether this part of the state changes in the scene."""
@@ -119,6 +123,18 @@ class Frames:
         values |= {"scene": self.scene, "start": start, "options": self.options}
         return Trajectory(self.scene.cloth, self.model.step_size, **values)
 
+    def last_step(self) -> list[State] | None:
+        """Copies the states before and after the last step; None where none led to the present state."""
+        if not self.filled or self.inputs_changed:
+            return None
+        ends = [self.state(), self.state()]
+        for name in FIELDS:
+            if self.moves(name):
+                kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                origin = self.arrays.origin if name == "position" else 0.0
+                setattr(ends[0], name, kept[self.filled - 1].astype(np.float64) + origin)
+        return ends
+
     # -- a run that is kept ------------------------------------------------------------------------------------------
 
     def record(self, pace: Pace, start: int) -> Trajectory:
@@ -134,6 +150,7 @@ class Frames:
 
     def keep(self, start: int, made: int) -> None:
         """Keeps the frames of a chunk that began after so many steps, if a run asks for them."""
+        self.filled, self.inputs_changed = made, False
         recording = self.recording
         if recording is None or not recording.open or start != recording.last:
             return
@@ -161,6 +178,7 @@ class Frames:
 
     def close(self) -> None:
         """Says that the state is another now than what the frames led to."""
+        self.filled = 0
         if self.recording is not None:
             self.recording.open = False
 

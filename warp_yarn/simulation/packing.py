@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ from ..description.obstacles import Box, Capsule, Contact, Cylinder, Obstacle, P
 from ..description.scene import Scene, Wind
 from ..description.weave import Weave
 from ..description.yarn import SIZES, Yarn
-from ..errors import choice, integer
+from ..errors import WarpYarnWarning, choice, integer
 
 SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
 
@@ -42,8 +45,17 @@ def packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
         "warp": cloth.warp,
         "weft": cloth.weft,
         "rest": cloth.position,
+        **_packed_outline(cloth),
         **given,
     }
+
+
+def _packed_outline(cloth: Cloth) -> dict[str, Any]:
+    """Packs what a cloth is cut to."""
+    if cloth.outline is None:
+        return {}
+    corners = np.concatenate([np.zeros((0, 2)), *cloth.holes])
+    return {"outline": cloth.outline, "holes": corners, "hole_corners": [len(hole) for hole in cloth.holes]}
 
 
 def unpacked_cloths(data: Any) -> Cloth | Cloths:
@@ -74,12 +86,15 @@ def _unpacked_cloth(data: Any, of: str) -> Cloth:
             numbers[name] = numbers[name], value(f"{name}_weft")
     if np.isnan(numbers["friction_damping"]).any():
         numbers["friction_damping"] = None
+    ends = np.cumsum(data[f"{of}hole_corners"]) if f"{of}hole_corners" in data else ()
     return Cloth(
         Weave(data[f"{of}draft"], str(data[f"{of}weave"])),
         yarns=yarns,
         warp=data[f"{of}warp"].tolist(),
         weft=data[f"{of}weft"].tolist(),
         pose=data[f"{of}rest"],
+        outline=data.get(f"{of}outline"),
+        holes=np.split(data[f"{of}holes"], ends[:-1]) if len(ends) else (),
         **numbers,
     )
 
@@ -95,7 +110,10 @@ def packed(scene: Scene) -> dict[str, Any]:
         "pins": scene.pins,
         "pin_stiffness": scene.pin_stiffness,
         "pin_path": scene.pin_path,
-        "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
+        "seams": scene.seams,
+        "seam_stiffness": scene.seam_stiffness,
+        "wind": None if wind is None else [*np.reshape(wind.velocity, (-1, 3))[0], wind.density, wind.drag],
+        "wind_path": None if wind is None or np.ndim(wind.velocity) == 1 else wind.velocity,
         "force_nodes": scene.force_nodes,
         **{f"force_{node}": force for node, force in scene.forces.items()},
         "parameters": list(scene.parameters) or None,
@@ -120,10 +138,11 @@ def unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         return data.get(f"scene_{name}")
 
     wind, stiffness, named = value("wind"), value("pin_stiffness"), value("parameters")
+    velocity = None if wind is None else wind[:3] if value("wind_path") is None else value("wind_path")
     return Scene(
         cloth,
         gravity=value("gravity"),
-        wind=None if wind is None else Wind(velocity=wind[:3], density=wind[3], drag=wind[4]),
+        wind=None if wind is None else Wind(velocity=velocity, density=wind[3], drag=wind[4]),
         pins=value("pins"),
         pin_stiffness=None if stiffness is None else stiffness.item(),
         pin_path=value("pin_path"),
@@ -135,9 +154,20 @@ def unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
         obstacles=_unpacked_obstacles(data),
         self_contact="scene_self_contact" in data and value("self_contact").item(),
         contact=Contact(**_arguments(data, "contact")),
+        **(
+            {"seams": value("seams"), "seam_stiffness": value("seam_stiffness").item()} if "scene_seams" in data else {}
+        ),
         contact_force=value("pressing").item() if "scene_pressing" in data else "published",
         crimp_interchange="scene_crimp_interchange" in data,
     )
+
+
+def warn_of_functions(path: str | os.PathLike, scene: Scene | None) -> None:
+    """Warns the caller's caller where a recording is written without its scene, whose functions no file holds."""
+    if scene is not None and scene.functions:
+        given = ", ".join(map(str, scene.functions))
+        text = f"{Path(path)} is written without its scene: functions ({given}) cannot be kept"
+        warnings.warn(text, WarpYarnWarning, stacklevel=3)
 
 
 def _unpacked_obstacles(data: Any) -> list[Obstacle]:

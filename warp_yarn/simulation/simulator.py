@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..device.model import Model
-from ..errors import choice, integer
+from ..errors import InputError, choice, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
@@ -19,14 +20,15 @@ from .checks import LARGEST, check_contact, checked_chunk, checked_state, checke
 from .diagnosis import Failure
 from .film import DECIDING, Filming, bar
 from .frames import Frames
+from .loads import Loads
 from .pace import Pace, every_of
-from .placing import Placing
 from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
 
 BESIDE_TERMS = (
     *("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path"),
+    *("gravity_path", "wind_velocity_path"),
     *("obstacle_position", "obstacle_rotation"),
 )
 """Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
@@ -41,7 +43,7 @@ def _of_stepper(name: str) -> Any:
     )
 
 
-class Simulator(Placing, Filming):
+class Simulator(Loads, Filming):
     """Simulates a scene.
 
     Threads may share one, and simulators may run in several threads: each call is as if it were alone. After an
@@ -79,15 +81,15 @@ class Simulator(Placing, Filming):
             stages tell its error. None: steps are made at once.
         energy_watch: whether a step that gains energy from nowhere is made again, and ends the run where that does not
             help (``docs/solver.md``). False is for who wants a method as it is, such as the paper's eq. 2.
-        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
+        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64; 1 with a hook.
         differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
+        hook: called with the simulator before each step, in whatever way it is run; it may read all and ``set_inputs``.
 
     Attributes:
         state: the present state, as a copy; set it to start from another one. ``steps_done`` stays as it is then.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up; set it where a
             state is one that was saved after so many steps.
-        trajectory: the frames of the last run, where an exception ended it, as long as the state is the last of them;
-            else None.
+        trajectory: the frames of the last run where an exception ended it and the state is the last of them, or None.
         split_steps: which of the steps since the beginning could not be made at once by the method, and their smallest
             part [s].
         damped_steps: those of them that gained energy, so that a method which damps made them, or parts of them.
@@ -112,21 +114,21 @@ class Simulator(Placing, Filming):
         energy_watch: bool = True,
         chunk: int | None = None,
         differentiable: bool = False,
+        hook: Callable[[Simulator], None] | None = None,
     ):
         self._options = {
             "step": step, "integrator": integrator, "device": device, "precision": precision, "threads": threads,
             "preconditioner": preconditioner, "tolerance": tolerance, "newton_tolerance": newton_tolerance,
             "max_iterations": max_iterations, "step_error": step_error, "energy_watch": energy_watch, "chunk": chunk,
-            "differentiable": differentiable,
+            "differentiable": differentiable, "hook": hook,
         }  # fmt: skip
         self.lock = threading.RLock()
         """Held while one thread uses the simulator; before ``exclusive.ALONE`` where both are."""
         with ALONE, compiling():
-            self.stepper = _made(scene, **self._options)
+            self.stepper = _made(self, scene, **self._options)
             self.scene, self.model, self.integrator = scene, self.stepper.model, self.stepper.integrator
             self.arrays, self.substepping = self.model.arrays, self.stepper.substepping
-            self.step_size = self.model.step_size
-            self.chunk = self.stepper.frames.chunk
+            self.chunk, self.step_size = self.stepper.frames.chunk, self.model.step_size
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
             self.stepper.frames.options = {name: self._options[name] for name in DECIDING}
@@ -235,6 +237,7 @@ class Simulator(Placing, Filming):
 
 
 def _made(
+    simulator: Simulator,
     scene: Scene,
     *,
     integrator: str,
@@ -242,6 +245,7 @@ def _made(
     energy_watch: bool,
     chunk: int | None,
     differentiable: bool,
+    hook: Any,
     max_iterations: int | None,
     **options: Any,
 ) -> Stepper:
@@ -251,7 +255,10 @@ def _made(
         integer("max_iterations", max_iterations, least=1, most=LARGEST)
     step_error = checked_step_error(step_error, integrator, differentiable)
     check_contact(scene, integrator)
-    model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, **options)
+    if hook is not None and not callable(hook):
+        raise InputError(f"hook = {hook!r}, must be a function of the simulator, or None")
+    hooked = hook is not None
+    model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, hooked=hooked, **options)
     model.energy.on = model.energy.on and bool(energy_watch)
     model.contact.damps_impacts = bool(energy_watch)
     refuse_recording(model.device)
@@ -260,10 +267,12 @@ def _made(
         at_once.estimate_errors()
     fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](model)
     substepping = Substepping(model, at_once, step_error and step_error * scene.cloth.shortest_spacing, fallback)
-    frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes))
+    frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes, one=hooked or bool(model.inputs.functions)))
     # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
     frames.upload(frames.rest())
-    return Stepper(model, at_once, substepping, frames)
+    stepper = Stepper(model, at_once, substepping, frames)
+    stepper.before_step = None if hook is None else lambda: hook(simulator)
+    return stepper
 
 
 def _rebuilt(

@@ -14,11 +14,12 @@ from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.scene import Scene
 from ..errors import InputError, brief, finite_array, integer, real
-from .packing import packed, packed_cloths, unpacked, unpacked_cloths
+from .packing import packed, packed_cloths, unpacked, unpacked_cloths, warn_of_functions
 
-FORMAT = 5
+FORMAT = 6
 """Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth; 3 had
-single numbers of cloths, no crimp and no sizes of yarns; 4 had every step, and did not say which method made them."""
+single numbers of cloths, no crimp and no sizes of yarns; 4 had every step, and did not say which method made them;
+5 had no wind that changes from step to step, no outlines and no seams, or else every step."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -196,6 +197,7 @@ class Trajectory:
 
     def save(self, path: str | os.PathLike, *, precision: str = "double", compression: int = 6) -> None:
         """Writes the cloth, its scene, every frame, and what a run goes on from; the file appears whole or not at all.
+        A scene with functions is left out, with a WarpYarnWarning: no file holds them.
 
         Args:
             path: of the file, ending in .h5 or .hdf5 (needs the extra ``data``), or an .npz of any name.
@@ -208,6 +210,7 @@ class Trajectory:
         """
         from ..io.recordings import save
 
+        warn_of_functions(path, self.scene)
         save(path, self, precision, compression)
 
     @classmethod
@@ -222,8 +225,8 @@ class Trajectory:
         return load(path, frames)
 
     def head(self) -> dict[str, Any]:
-        """Packs all but the frames into arrays."""
-        end = self.end
+        """Packs all but the frames into arrays; a scene with functions is left out."""
+        end, scene = self.end, self.scene
         values: dict[str, Any] = {"format": FORMAT, "start": self.start, "step": self.step, "every": self.every}
         if end is not None:
             state = end.state.checked(self.cloth.nodes)
@@ -231,7 +234,8 @@ class Trajectory:
             values |= {f"end_{name}": getattr(state, name) for name in FIELDS}
         if self.options is not None:
             values["options"] = json.dumps(self.options, default=float)
-        return {**values, **packed_cloths(self.cloth), **({} if self.scene is None else packed(self.scene))}
+        known = {} if scene is None or scene.functions else packed(scene)
+        return {**values, **packed_cloths(self.cloth), **known}
 
     @classmethod
     def of_head(cls, data: Mapping[str, Any]) -> Trajectory:

@@ -365,5 +365,5 @@ def _flipped(cloth: Cloth | Cloths) -> np.ndarray:
     """Tells where warp is over weft [nodes], at the edge too, where a simulation takes no account of it."""
     if isinstance(cloth, Cloths):
         return np.concatenate([_flipped(each) for each in cloth.cloths])
-    inside, draft = cloth.topology.flipped.astype(bool), cloth.weave.draft.ravel()
-    return draft if draft.shape == inside.shape else inside
+    row, column = cloth.topology.place.T
+    return cloth.weave.draft[row, column]
