@@ -1,7 +1,9 @@
-"""Keeps Warp quiet and torch to one thread, gives the tests of a term their cases, knows which ones are slow, and has
-options --shuffled, --slower-than."""
+"""Keeps Warp quiet and torch to one thread, gives the tests of a term their cases, knows which ones are slow, has
+options --shuffled, --slower-than, and a disk that fills up."""
 
+import subprocess
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -85,3 +87,17 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def scripts_at_collection(pytestconfig: pytest.Config) -> list[str]:
     """Scripts of scenes/ and benchmarks/ that were imported when the tests had been collected."""
     return pytestconfig.stash[SCRIPTS_AT_COLLECTION]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 3 MB, where this process may mount one."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(folder)]
+    try:
+        subprocess.run(mount, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("needs the right to mount a disk")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)

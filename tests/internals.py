@@ -273,9 +273,8 @@ def locks_taken() -> list[object]:
 
 halved: Callable = ablation._halved
 unneeded: Callable = ablation._unneeded
-resampled: Callable = render._resampled
-pyvista: Callable = render._pyvista
-Camera, Picture = render._Camera, render._Picture
+picture_times: Callable = render._times
+Picture = render._Picture
 
 
 def resolved_with_its_adjoint(

@@ -282,6 +282,37 @@ def test_frames_of_another_run_are_refused():
         wy.Simulator(moved(None, fabric=wy.fabrics.cotton)).reactions(trajectory)
 
 
+def test_frames_that_are_not_those_of_steps_are_refused():
+    """Between frames that skip steps, or lie between two, there is no step to look into."""
+    trajectory = wy.Simulator(moved(None)).run(6)
+    simulator = wy.Simulator(moved(None))
+    film = simulator.run(6, fps=400.0)
+    for frames, every in ((trajectory[::2], "2"), (film, "2.5")):
+        with pytest.raises(wy.InputError, match=rf"trajectory\.every = {every}, must be 1"):
+            simulator.reactions(frames)
+        with pytest.raises(wy.InputError, match=rf"trajectory\.every = {every}, must be 1"):
+            simulator.work(frames)
+    np.testing.assert_array_equal(simulator.reactions(trajectory[2:5]), simulator.reactions(trajectory)[2:4])
+
+
+@pytest.mark.parametrize("chunk", [1, 4])
+def test_reactions_as_frames_come(chunk):
+    """The last step is that before the frame, or the one that it lies in."""
+    expected = wy.Simulator(moved(None)).run(6)
+    expected = wy.Simulator(moved(None)).reactions(expected)
+    for fps, steps in ((None, range(7)), (500.0, range(0, 7, 2)), (400.0, (0, 3, 5))):
+        simulator = wy.Simulator(moved(None), chunk=chunk)
+        frames = simulator.frames(6, fps=fps)
+        next(frames)
+        with pytest.raises(wy.InputError, match="no step was made"):
+            simulator.reactions()
+        found = [(simulator.steps_done, simulator.reactions(), simulator.work()["pins"]) for _ in frames]
+        assert [step for step, _, _ in found] == list(steps[1:])
+        for step, forces, work in found:
+            np.testing.assert_array_equal(forces, expected[step - 1])
+            assert np.isfinite(work)
+
+
 def test_impact_zones_have_no_forces():
     cloth = wy.paper.cloth(rows=4, columns=4)
     plane = wy.Plane(point=(0, 0, -1.0), normal=(0, 0, 1), friction=0.0)

@@ -231,6 +231,7 @@ FEWER = {
     "control.md": {"epochs=70": "epochs=1"},
     "gradients.md": {"rows=9, columns=9": "rows=4, columns=4", "steps=50, frames=[50]": "steps=10, frames=[10]"},
     "api/simulation.md": {"rows=9, columns=9": "rows=4, columns=4"},
+    "pictures.md": {"rows=9, columns=9": "rows=4, columns=4", "run(100)": "run(4)", "viewer.wait()": "viewer.close()"},
 }
 """What is made smaller to be quick."""
 ELSEWHERE = ("drafts.md", "tutorial.md")
@@ -249,6 +250,8 @@ def test_the_code_of_a_page_runs(page, folder):
     for old, new in FEWER.get(page, {}).items():
         assert any(old in block for block in blocks)
         blocks = [block.replace(old, new) for block in blocks]
+    # tests/test_blender.py runs what is Blender's
+    blocks = [block for block in blocks if not block.startswith("import bpy")]
     blocks.insert(0, BEFORE.get(page, ""))
     blocks.insert(len(blocks) - 1, BETWEEN.get(page, ""))
     try:

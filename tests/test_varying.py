@@ -450,6 +450,34 @@ def test_functions_are_not_recorded_and_that_is_said(tmp_path):
     assert wy.Trajectory.load(path) == trajectory
 
 
+@pytest.mark.parametrize("name", ["run.npz", "run.h5"])
+def test_films_of_functions_are_written_without_their_scene(tmp_path, name):
+    path = tmp_path / name
+    simulator = wy.Simulator(scene(wind=wy.Wind(velocity=blowing)))
+    with pytest.warns(wy.WarpYarnWarning, match=rf"{name} is written without its scene: functions \(wind\)") as told:
+        simulator.record(path, tmp_path / "run.usdc", steps=2)
+    assert len(told) == 1 and told[0].filename == __file__
+    loaded = wy.Trajectory.load(path)
+    assert loaded.scene is None and loaded == run(simulator.scene, 2)
+    with pytest.raises(wy.InputError, match="has no scene"):
+        simulator.record(tmp_path / "more.npz", steps=1, after=path)
+    with pytest.raises(wy.InputError, match="has no scene to go on with"):
+        wy.Simulator.resumed(path)
+    # what is in memory has it
+    assert wy.Simulator.resumed(run(simulator.scene, 2)).run(1)[1] == run(simulator.scene, 3)[3]
+
+
+def test_recordings_of_a_run_with_a_hook_go_on_without_it(tmp_path):
+    """A hook is no option that a file holds; who goes on gives it again."""
+    path, options = tmp_path / "run.npz", {"hook": lambda simulator: simulator.set_inputs(gravity=(1.0, 0.0, 0.0))}
+    simulator = wy.Simulator(scene(), **options)
+    simulator.record(path, steps=2)
+    whole = run(scene(), 4, **options)
+    assert "hook" not in wy.Trajectory.load(path).options
+    assert wy.Simulator.resumed(path, **options).run(2) == whole[2:]
+    assert wy.Simulator.resumed(path).run(2) != whole[2:]
+
+
 # -- gradients ---------------------------------------------------------------------------------------------------------
 
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ..description.cloth import CLOTH_NUMBERS
 from ..description.scene import Scene
 from ..errors import InputError, real
-from ..simulation.state import CLOTH_NUMBERS
 
 OF_YARNS = ("density", "stretch", "bend")
 OF_CLOTHS = tuple(name for name in CLOTH_NUMBERS if name not in ("spacing", "radius"))

@@ -55,7 +55,7 @@ class CalibrationProblem:
 
     Args:
         scene: the model; what is not learned keeps its values.
-        target: the frames.
+        target: the frames; where ``pin_path`` or ``forces`` change, every step of a run from its beginning.
         parameters: what to learn.
         frames: how many frames to compare with, at least 1; None: all that there are.
         first: the frame to start from.
@@ -253,6 +253,12 @@ def chosen_frames(scene: Scene, target: Trajectory, frames: int | None, first: i
         )
     for name in FIELDS:
         finite_array(f"target.{name}", getattr(target, name), (len(target), scene.cloth.nodes, STATE_TYPES[name]))
+    moves = scene.pin_path is not None or len(scene.force_path) > 1
+    if moves and (target.start, target.every) != (0, 1):
+        raise InputError(
+            f"target.start = {target.start:g} and every = {target.every:g}, must be 0 and 1: pin_path and forces of "
+            "the scene go by the target's frames; the arguments first and every take some of them"
+        )
     first, every = integer("first", first, least=0), integer("every", every, least=1)
     there = max(0, len(target) - 1 - first) // every
     wanted = there if frames is None else integer("frames", frames, least=1)

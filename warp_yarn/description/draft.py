@@ -83,7 +83,7 @@ class Draft(Replaceable):
     def from_weave(cls, weave: Weave) -> Draft:
         """Finds a loom for a weave: ends that move alike are on one shaft, picks that are alike have one treadle.
 
-        On the border of a weave nothing crosses; in the draft the ends are down there.
+        It has the border of the weave as that was given, though nothing crosses there.
         """
         if not isinstance(weave, Weave):
             raise InputError(f"weave = {weave!r}, must be a Weave")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, finite_array, real
+from ..errors import InputError, choice, finite_array, missing_extra, real
 from .fixed import Fixed
 
 ROUNDING = 1e-15
@@ -230,7 +230,7 @@ class TriangleMesh(Obstacle):
         try:
             import trimesh
         except ModuleNotFoundError as error:
-            raise InputError("reading meshes needs trimesh: pip install trimesh") from error
+            raise missing_extra("trimesh", "files of meshes need", "meshes") from error
         try:
             mesh: Any = trimesh.load(str(file), force="mesh", process=False)
             return cls(scale * np.asarray(mesh.vertices), np.asarray(mesh.faces), **options)

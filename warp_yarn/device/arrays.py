@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..description.cloth import Cloth
+from ..description.cloth import CLOTH_NUMBERS, Cloth
 from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
@@ -18,7 +18,6 @@ from ..description.seams import sewn
 from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
-from ..simulation.state import CLOTH_NUMBERS
 from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions

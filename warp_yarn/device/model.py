@@ -13,10 +13,10 @@ import warp as wp
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
 from ..description.varying import has_gusts
-from ..errors import InputError, choice, integer, real
+from ..errors import InputError, brief, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build, own
 from ..kernels.core.general import NUMBERS
-from . import defaults
+from . import defaults, start
 from .arrays import Arrays
 from .contact import Contact
 from .declarations import INPUTS
@@ -71,7 +71,7 @@ class Model:
         hooked: bool = False,
     ):
         if not isinstance(scene, Scene):
-            raise InputError(f"scene = {scene!r}, must be a Scene")
+            raise InputError(f"scene = {brief(scene)}, must be a Scene")
         self.scene = scene
         self.step_size = real("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
@@ -260,7 +260,7 @@ def _presses(model: Model, term: Term) -> int:
 def _checked_device(device: Any) -> Any:
     """Finds a device of Warp."""
     try:
-        return wp.get_device(device)
+        return start.device(device)
     except Exception as error:
         names = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"device = {device!r}, must be one of {names}") from error

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..description.scene import Scene
-from ..errors import InputError, integer, real
+from ..errors import InputError, brief, integer, real
 from ..integrators import INTEGRATORS
 from ..integrators.linear import LinearlyImplicitEuler
 from ..integrators.stage import StageMethod
 from .state import State
 
-CHUNK_BYTES = 1 << 24
+CHUNK_BYTES = 1 << 22
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
 
 FRAME_BYTES = 13 * 8
@@ -34,7 +34,7 @@ def checked_state(state: Any, scene: Scene) -> State:
             nothing does.
     """
     if not isinstance(state, State):
-        raise InputError(f"state = {state!r}, must be a State")
+        raise InputError(f"state = {brief(state)}, must be a State")
     state = state.checked(scene.cloth.nodes)
     topology = scene.cloth.topology
     direction = topology.yarn_direction[topology.segment_yarn]

@@ -46,7 +46,7 @@ class Loads(Placing):
 
         Raises:
             InputError: no step was made since the state was set, or what it had by ``set_inputs`` or
-                ``place_obstacles``; frames of another cloth or step; impact zones, which
+                ``place_obstacles``; frames of another cloth or step, or not of every step; impact zones, which
                 have no forces; a registered integrator that is no StageMethod.
         """
         steps = Steps(self.stepper, trajectory)

@@ -57,7 +57,7 @@ class Steps:
         trajectory: the frames; None: the last step.
 
     Raises:
-        InputError: no step was made since a state was set, or frames of another cloth or step.
+        InputError: no step was made since a state was set, or frames of another cloth or step, or not of every step.
     """
 
     def __init__(self, stepper: Stepper, trajectory: Trajectory | None):
@@ -88,9 +88,14 @@ class Steps:
                 raise InputError(
                     "trajectory with a hook, whose inputs are not known any more: ask for the last step, as in the hook"
                 )
+            if trajectory.every != 1 or trajectory.start != round(trajectory.start):
+                raise InputError(
+                    f"trajectory.every = {trajectory.every:g}, must be 1, with a frame of every step: run without fps, "
+                    "and take no stride"
+                )
             if trajectory.step != self.model.step_size:
                 raise InputError(f"trajectory.step = {trajectory.step:g}, must be {self.model.step_size:g}")
-            self.frames, self.start = trajectory, trajectory.start
+            self.frames, self.start = trajectory, round(trajectory.start)
         self.only, self._warned = trajectory is None, False
 
     def __len__(self) -> int:

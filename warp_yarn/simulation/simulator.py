@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 import threading
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import tqdm
 
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
@@ -21,8 +18,10 @@ from ..moved import renamed_attribute
 from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
 from .diagnosis import Failure
+from .film import DECIDING, Filming, bar
 from .frames import Frames
 from .loads import Loads
+from .pace import Pace, every_of
 from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
@@ -44,7 +43,7 @@ def _of_stepper(name: str) -> Any:
     )
 
 
-class Simulator(Loads):
+class Simulator(Loads, Filming):
     """Simulates a scene.
 
     Threads may share one, and simulators may run in several threads: each call is as if it were alone. After an
@@ -132,6 +131,7 @@ class Simulator(Loads):
             self.chunk, self.step_size = self.stepper.frames.chunk, self.model.step_size
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
+            self.stepper.frames.options = {name: self._options[name] for name in DECIDING}
         self.check_clear()
         warn_of_threads(threads)
 
@@ -178,32 +178,15 @@ class Simulator(Loads):
     split_steps = _of_stepper("split_steps")
     damped_steps = _of_stepper("damped_steps")
 
-    @property
-    @alone
-    def trajectory(self) -> Trajectory | None:
-        """The frames of the last run where an exception ended it, the one that it started from first; None where none
-        did, or where the state is no longer the last of them."""
-        return self.stepper.frames.recorded(self.stepper.steps_done)
-
     def run_chunk(self, steps: int) -> int:
         """Makes at most ``chunk`` steps, into the frames on the device; the state is frame 0.
 
         Returns:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
+        integer("steps", steps, least=0, most=self.chunk)
         with self.lock:
             return self.stepper.make_chunk(steps)
-
-    @alone
-    def chunk_trajectory(self, frames: int) -> Trajectory:
-        """Copies the first frames of the chunk that the device holds."""
-        trajectory = self.stepper.frames.room(frames, self.stepper.steps_done - frames + 1)
-        self.stepper.frames.copy(trajectory, 0, frames)
-        return trajectory
-
-    def moves(self, name: str) -> bool:
-        """Tells whether this part of the state changes in this scene."""
-        return self.stepper.frames.moves(name)
 
     @alone
     def fail(self, k: int, trajectory: Trajectory) -> None:
@@ -213,37 +196,44 @@ class Simulator(Loads):
             forces, near = self.forces(), self.told_nearest(failure.node)
         raise failure.error(k, trajectory, forces, self.substepping, self.step_error, near)
 
-    def run(self, steps: int, *, progress: bool | None = False) -> Trajectory:
-        """Makes steps and returns every frame, the present one first.
+    def run(
+        self,
+        steps: int | None = None,
+        *,
+        seconds: float | None = None,
+        fps: float | None = None,
+        progress: bool | None = False,
+    ) -> Trajectory:
+        """Makes steps and returns their frames, the present one first.
 
         Args:
-            steps: how many, at least 0.
+            steps: how many, at least 0; or
+            seconds: how long, at least 0: as many steps as it takes to get there.
+            fps: frames in a second of simulated time, at most one a step; None: one a step. Frame k is at k / fps:
+                where that is between two steps, on the straight line between their states.
             progress: whether to show a progress bar on stderr; None: where that is a terminal.
 
         Raises:
-            InputError: more steps than the memory holds frames of.
+            InputError: an argument is out of its range, or more frames than the memory holds.
             SimulationError: where a step cannot be made; it has the frames before it, and the simulator stays at the
-                last of them. After this or another exception, Ctrl-C too, ``trajectory`` has them.
+                last step. After this or another exception, Ctrl-C too, ``trajectory`` has them.
         """
-        steps = integer("steps", steps, least=0)
         with self.lock:
-            trajectory, done = self._record(steps), 0
-            with _bar(steps, progress) as bar:
-                while done < steps:
-                    asked = min(self.chunk, steps - done)
+            pace, done = Pace.of(self.step_size, steps, seconds, every_of(fps, self.step_size)), 0
+            self._record(pace)
+            with bar(pace.steps, progress) as shown:
+                while done < pace.steps:
+                    asked = min(self.chunk, pace.steps - done)
                     made = self.run_chunk(asked)
                     done += made
-                    if bar is not None:
-                        bar.set_description("simulating", refresh=False)
-                        bar.update(made)
+                    if shown is not None:
+                        shown.set_description("simulating", refresh=False)
+                        shown.update(made)
                     if made < asked:
-                        self.fail(done + 1, trajectory.cut(done + 1))
+                        self.fail(done + 1, self.trajectory)
+            trajectory = self.trajectory
             self.stepper.frames.recording = None
         return trajectory
-
-    @alone
-    def _record(self, steps: int) -> Trajectory:
-        return self.stepper.frames.record(steps, self.stepper.steps_done)
 
 
 def _made(
@@ -306,10 +296,3 @@ def _rebuilt(
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size
     return result
-
-
-def _bar(steps: int, progress: bool | None) -> contextlib.AbstractContextManager[tqdm.tqdm | None]:
-    """Makes a progress bar where one is wanted. Elsewhere there is none at all: tqdm's lock does not survive Ctrl-C."""
-    if progress is None:
-        progress = sys.stderr is not None and sys.stderr.isatty()
-    return tqdm.tqdm(total=steps, unit="step", leave=False, desc="starting") if progress else contextlib.nullcontext()
