@@ -216,6 +216,7 @@ def test_step_5_the_yarns_are_found(folder):
 
 HUNG = "import warp_yarn as wy\n"
 BEFORE = {
+    "choosing.md": HUNG + "simulator = wy.Simulator(wy.paper.hung_cloth(rows=4, columns=4))\n",
     "contact.md": HUNG + "cloth = wy.paper.cloth(rows=4, columns=4, pose='flat')\n"
     "cloth = cloth.replace(pose=cloth.position + [0, 0, 0.0125])\n",
     "learning.md": HUNG + "wy.Simulator(wy.paper.hung_cloth(rows=4, columns=4)).run(12).save('out/hang.npz')\n",
@@ -227,7 +228,7 @@ BETWEEN = {
 """And before its last block."""
 FEWER = {
     "README.md": {"rows=31, columns=31": "rows=5, columns=5"},
-    "choosing.md": {"17": "5"},
+    "choosing.md": {"17": "5", "seconds=5": "seconds=0.1"},
     "contact.md": {"run(300)": "run(3)"},
     "control.md": {"epochs=70": "epochs=1"},
     "gradients.md": {"rows=9, columns=9": "rows=4, columns=4", "steps=50, frames=[50]": "steps=10, frames=[10]"},
