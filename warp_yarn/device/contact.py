@@ -190,16 +190,18 @@ class Contact:
 
     def make_room(self, room: int | None = None) -> None:
         """Make room for so many samples near each, or for twice as many of what is full, and twice as many faces; the
-        next look makes a list."""
+        next look makes a list. Where a later matrix has counted anew since, twice as many of both."""
         a = self.model.arrays
         if self.self_contact:
             # of what is near, half may touch
-            for kind, part, arrays in (("near", 1, ("near",)), ("touch", 2, ("touch", "touch_block"))):
-                if room or int(a[f"{kind}_count"].numpy().max()) >= a[f"{kind}_room"]:
-                    a[f"{kind}_room"] = max(room // part, 1) if room else 2 * a[f"{kind}_room"]
-                    a.sizes[kind] = a[f"{kind}_room"] * self.samples.count
-                    for name in arrays:
-                        a[name] = a.new(name)
+            kinds = {"near": (1, ("near",)), "touch": (2, ("touch", "touch_block"))}
+            full = [kind for kind in kinds if int(a[f"{kind}_count"].numpy().max()) >= a[f"{kind}_room"]]
+            for kind in kinds if room else full or kinds:
+                part, arrays = kinds[kind]
+                a[f"{kind}_room"] = max(room // part, 1) if room else 2 * a[f"{kind}_room"]
+                a.sizes[kind] = a[f"{kind}_room"] * self.samples.count
+                for name in arrays:
+                    a[name] = a.new(name)
             # far from everywhere
             a["near_position"].fill_(np.nan)
         if self.has_mesh and room is None:
