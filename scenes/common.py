@@ -23,7 +23,8 @@ from warp_yarn.io.files import check_writable
 from warp_yarn.io.films import RECORDINGS
 from warp_yarn.presets.fabrics import FABRICS
 from warp_yarn.simulation.pace import ROUNDING
-from warp_yarn.view.render import check_drawing
+from warp_yarn.view.camera import checked_view
+from warp_yarn.view.render import check_drawing, checked_size
 
 MISSING: list[tuple[str, str]] = []
 """Packages that a scene asked for and did not find, and the extras that they are of."""
@@ -177,16 +178,61 @@ def write_all(trajectory: wy.Trajectory, *writers: Callable[[], None]) -> None:
         raise failures[0]
 
 
-def draw(run: Run, options: argparse.Namespace, **picture: Any) -> None:
-    """Draws what --png and --mp4 ask for."""
-    writers, trajectory = [], run.trajectory
+def add_pictures(parser: argparse.ArgumentParser, shown: str = "the last frame") -> None:
+    """The options --png and --mp4, and --pixels and --view of both.
+
+    Args:
+        shown: in the picture.
+    """
+    add = parser.add_argument
+    add("--png", type=file_ending(".png"), metavar="FILE", help=f"a picture of {shown}")
+    add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
+    add("--pixels", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="of the picture, and of the movie")
+    add(
+        "--view", type=float, nargs=3, metavar=("X", "Y", "Z"), help="from the cloth to the camera; 0 0 1 is from above"
+    )
+
+
+def check_pictures(options: argparse.Namespace) -> None:
+    """Finds out before a run whether pictures and movies that are asked for can be drawn.
+
+    Raises:
+        InputError: they cannot, or an option of theirs is out of its range.
+    """
+    if options.pixels is not None:
+        checked_size("--pixels", options.pixels, movie=options.mp4 is not None)
+    if options.view is not None:
+        checked_view("--view", options.view)
+    if options.png is not None or options.mp4 is not None:
+        check_drawing(movies=options.mp4 is not None)
+
+
+def pictures(
+    trajectory: wy.Trajectory, options: argparse.Namespace, still: wy.Trajectory | None = None, **picture: Any
+) -> list[Callable[[], None]]:
+    """What writes the files that --png and --mp4 ask for.
+
+    Args:
+        still: whose last frame the picture shows; None: that of the trajectory.
+        picture: size and view where the options have none.
+    """
+    if options.pixels is not None:
+        picture["size"] = options.pixels
+    if options.view is not None:
+        picture["view"] = options.view
+    writers: list[Callable[[], None]] = []
     if options.png is not None:
-        writers.append(lambda: wy.write_png(options.png, trajectory, **picture))
+        writers.append(lambda: wy.write_png(options.png, trajectory if still is None else still, **picture))
     if options.mp4 is not None:
-        rate = {} if options.fps is None else {"frames_per_second": options.fps}
-        slow = {"slowdown": options.slowdown, **rate}
+        rate = {} if getattr(options, "fps", None) is None else {"frames_per_second": options.fps}
+        slow = {"slowdown": options.slowdown, **rate, **picture}
         writers.append(lambda: wy.write_mp4(options.mp4, trajectory, progress=None, **slow))
-    write_all(trajectory, *writers)
+    return writers
+
+
+def draw(run: Run, options: argparse.Namespace, **picture: Any) -> None:
+    """Draws what --png and --mp4 ask for, as of ``pictures``."""
+    write_all(run.trajectory, *pictures(run.trajectory, options, **picture))
 
 
 def read_number(name: str, text: str, **allowed: float) -> float:
@@ -259,16 +305,6 @@ def add_slowdown(parser: argparse.ArgumentParser) -> None:
     """The option --slowdown of what is written to be played."""
     text = "seconds of playing time for one of simulated time, in files (%(default)g)"
     parser.add_argument("--slowdown", type=number_above("--slowdown", 0.0), default=20.0, metavar="FACTOR", help=text)
-
-
-def check_pictures(png: Path | None, mp4: Path | None) -> None:
-    """Finds out before a run whether pictures and movies that are asked for can be drawn.
-
-    Raises:
-        InputError: they cannot.
-    """
-    if png is not None or mp4 is not None:
-        check_drawing(movies=mp4 is not None)
 
 
 def make_folders(paths: Sequence[Path | None]) -> None:

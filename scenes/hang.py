@@ -21,6 +21,7 @@ import numpy as np
 from common import (
     Run,
     add_length,
+    add_pictures,
     add_weave,
     check_pictures,
     command,
@@ -64,8 +65,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--output", type=file_ending(*ENDINGS), default=Path("out/hang.usdc"), metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
-    add("--png", type=file_ending(".png"), metavar="FILE", help="a picture of the last frame")
-    add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
+    add_pictures(result)
     text = "the frames as numbers (.npz, .h5), for --resume and wy.Trajectory.load"
     add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     text = "go on from the end of a recording, at its frames a second"
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     simulator = resumed(options) if options.resume is not None else wy.Simulator(**chosen(options))
     settle_length(options, simulator.step_size)
     make_folders([options.output, options.png, options.mp4, options.record])
-    check_pictures(options.png, options.mp4)
+    check_pictures(options)
     run = simulate(simulator, options, [options.output, options.record], after=options.resume)
     draw(run, options)
     tell(run, options)

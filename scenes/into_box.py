@@ -22,7 +22,17 @@ from typing import Any
 
 import numpy as np
 import tqdm
-from common import add_slowdown, check_pictures, file_ending, make_folders, optional, parse, write_all
+from common import (
+    add_pictures,
+    add_slowdown,
+    check_pictures,
+    file_ending,
+    make_folders,
+    optional,
+    parse,
+    pictures,
+    write_all,
+)
 
 import warp_yarn as wy
 from warp_yarn.envs import box
@@ -54,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     add("--output", type=file_ending(*ENDINGS), default=Path("out/box.usdc"), metavar="USD", help="(%(default)s)")
     add("--plot", type=file_ending(".png"), metavar="PNG", help="loss by epoch (the USD file's name, .png)")
     add("--result", type=file_ending(".json"), metavar="JSON", help="numbers (the USD file's name, .json)")
-    add("--png", type=file_ending(".png"), metavar="FILE", help="the throw, several moments in one picture")
+    add_pictures(result, "several moments of the throw")
     add_slowdown(result)
     return result
 
@@ -74,8 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     integer("--seed", options.seed, least=0)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
-    make_folders([options.output, options.plot, options.result, options.png])
-    check_pictures(options.png, None)
+    make_folders([options.output, options.plot, options.result, options.png, options.mp4])
+    check_pictures(options)
     policy = getattr(throws, POLICIES[options.learn])(options.seed)
     found: list[throws.Epoch] = []
     stop: BaseException | None = None
@@ -96,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         result = numbers(found, best, options)
         write(found, best, result, options)
         tell(result)
-        files = [options.output, options.plot, options.result, options.png]
+        files = [options.output, options.plot, options.result, options.png, options.mp4]
         print("written:", ", ".join(str(file) for file in files if file is not None))
     if stop is not None:
         raise stop
@@ -135,9 +145,8 @@ def write(
         lambda: plot(options.plot, found),
         lambda: wy.write_usd(options.output, trajectory, slowdown=options.slowdown),
     ]
-    if options.png is not None:
-        writers.append(lambda: wy.write_png(options.png, moments(trajectory), view=VIEW))
-    write_all(trajectory, *writers)
+    still = None if options.png is None else moments(trajectory)
+    write_all(trajectory, *writers, *pictures(trajectory, options, still, view=VIEW))
 
 
 def moments(trajectory: wy.Trajectory) -> wy.Trajectory:

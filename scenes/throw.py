@@ -23,7 +23,20 @@ from typing import Any
 import into_box
 import numpy as np
 import tqdm
-from common import add_slowdown, add_weave, command, file_ending, make_folders, optional, parse, woven_cloth, write_all
+from common import (
+    add_pictures,
+    add_slowdown,
+    add_weave,
+    check_pictures,
+    command,
+    file_ending,
+    make_folders,
+    optional,
+    parse,
+    pictures,
+    woven_cloth,
+    write_all,
+)
 
 import warp_yarn as wy
 from warp_yarn.errors import finite_array, integer, real
@@ -221,6 +234,7 @@ def parser() -> argparse.ArgumentParser:
     add("--output", type=file_ending(*ENDINGS), default=Path("out/throw.usdc"), metavar="USD", help="(%(default)s)")
     add("--plot", type=file_ending(".png"), metavar="PNG", help="loss by iteration (the USD file's name, .png)")
     add("--result", type=file_ending(".json"), metavar="JSON", help="numbers (the USD file's name, .json)")
+    add_pictures(result)
     add_slowdown(result)
     return result
 
@@ -243,7 +257,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     integer("--iterations", options.iterations, least=1)
     real("--rate", options.rate, above=0.0)
     real("--within", options.within, least=0.0)
-    make_folders([options.output, options.plot, options.result])
+    make_folders([options.output, options.plot, options.result, options.png, options.mp4])
+    check_pictures(options)
     cloth = woven_cloth(options.fabric, options, options.size, options.size, pose="flat")
     throw = Throw(
         cloth,
@@ -259,7 +274,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         result = numbers(throw, found)
         write(throw, found, result, options)
         tell(throw, result)
-        print("written:", ", ".join(str(file) for file in (options.output, options.plot, options.result)))
+        files = (options.output, options.plot, options.result, options.png, options.mp4)
+        print("written:", ", ".join(str(file) for file in files if file is not None))
     if found.stop is not None:
         raise found.stop
     return result
@@ -296,6 +312,7 @@ def write(throw: Throw, found: Search, result: dict[str, Any], options: argparse
         trajectory,
         lambda: plot(options.plot, found),
         lambda: wy.write_usd(options.output, trajectory, slowdown=options.slowdown),
+        *pictures(trajectory, options),
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from common import (
     Run,
     add_length,
+    add_pictures,
     add_weave,
     check_pictures,
     draw,
@@ -53,8 +54,7 @@ def parser(text: str | None, name: str, *, rows: int, columns: int, steps: int) 
     output = Path(f"out/{name}.usdc")
     add("--output", type=file_ending(*ENDINGS), default=output, metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
-    add("--png", type=file_ending(".png"), metavar="FILE", help="a picture of the last frame")
-    add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
+    add_pictures(result)
     text = "the frames as numbers (.npz, .h5), for wy.Trajectory.load"
     add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     return result
@@ -72,7 +72,7 @@ def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argp
     options = of.parse_args(arguments)
     settle_length(options, options.step)
     make_folders([options.output, options.png, options.mp4, options.record])
-    check_pictures(options.png, options.mp4)
+    check_pictures(options)
     return options
 
 

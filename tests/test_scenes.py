@@ -1,6 +1,7 @@
 """scenes/hang.py at 5 × 5, in this process."""
 
 import dataclasses
+import functools
 import os
 import shutil
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 from internals import a_step_at_a_time, put
@@ -229,6 +231,59 @@ def test_lengths_and_rates_out_of_range_are_named(scene, arguments, named, tmp_p
     monkeypatch.chdir(tmp_path)
     assert exit_code(load(f"scenes/{scene}.py"), arguments) == 2
     assert named in capsys.readouterr().err and not list(tmp_path.rglob("*"))
+
+
+DRAWING = {
+    "hang": ["--size", "3", "--steps", "2"],
+    "drape": ["--rows", "4", "--columns", "4", "--steps", "2"],
+    "fold": ["--rows", "4", "--columns", "9", "--steps", "2"],
+    "pull": ["--rows", "4", "--columns", "4", "--steps", "2"],
+    "stack": ["--rows", "3", "--columns", "5", "--layers", "2", "--steps", "2"],
+    "throw": ["--size", "3", "--steps", "8", "--iterations", "1"],
+    "throw into a box": ["--box", "--epochs", "1"],
+}
+"""Short runs of every scene that draws."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", DRAWING)
+def test_pictures_of_a_size_and_from_where_they_are_asked_for(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    views = []
+    for draw in ("write_png", "write_mp4"):
+        monkeypatch.setattr(wy, draw, functools.partial(seen_by, getattr(wy, draw), views))
+    asked = ["--png", "a.png", "--mp4", "a.mp4", "--pixels", "64", "48", "--view", "0", "-1", "0.5"]
+    assert exit_code(load(f"scenes/{scene.split()[0]}.py"), [*DRAWING[scene], *asked]) == 0
+    assert imageio.imread("a.png").shape == (48, 64, 3)
+    with imageio.get_reader("a.mp4") as movie:
+        assert movie.get_data(0).shape == (48, 64, 3)
+    assert views == [[0.0, -1.0, 0.5]] * 2
+
+
+def seen_by(draw, views, *arguments, **options):
+    views.append(options["view"])
+    draw(*arguments, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", DRAWING)
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--pixels", "64", "8"], "--pixels[1] = 8"),
+        (["--pixels", "64"], "--pixels"),
+        (["--mp4", "a.mp4", "--pixels", "64", "49"], "--pixels = (64, 49), must be even in a movie"),
+        (["--view", "0", "0", "0"], "--view = (0.0, 0.0, 0.0), must not be 0"),
+        (["--view", "0", "nan", "0"], "--view[1] is nan"),
+    ],
+)
+def test_pictures_that_cannot_be_are_named_before_the_run(scene, arguments, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(wy.Simulator, "run_chunk", None)
+    script = load(f"scenes/{scene.split()[0]}.py")
+    assert exit_code(script, [*DRAWING[scene], "--png", "a.png", *arguments]) == 2
+    assert named in capsys.readouterr().err
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 @pytest.mark.parametrize("scene", ["hang", "stack"])

@@ -71,9 +71,7 @@ class Camera:
         Raises:
             InputError: a view that is none.
         """
-        toward = finite_array("view", view, (3,))
-        if not toward.any():
-            raise InputError(f"view = {tuple(view)}, must not be 0")
+        toward = checked_view("view", view)
         up = np.array([0.0, 0.0, 1.0])
         axes = _axes(toward, up)
         slope = np.tan(np.radians(0.5 * lens)) * np.array([aspect, 1.0])
@@ -92,6 +90,14 @@ class Camera:
         distance = max(float(needs.max()), float(0.5 * (top - low)[2] + 4.0 * radius))
         target = centre @ axes
         return cls(tuple(target + distance * axes[2]), tuple(target), tuple(up), lens)
+
+
+def checked_view(name: str, view: Sequence[float]) -> np.ndarray:
+    """Gives a direction to look from [3], or an InputError."""
+    toward = finite_array(name, view, (3,))
+    if not toward.any():
+        raise InputError(f"{name} = {tuple(view)}, must not be 0")
+    return toward
 
 
 def _axes(toward: np.ndarray, up: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ def write_png(
         InputError: an argument is out of its range, the folder of `path` does not exist, or imageio is not installed.
     """
     _check_ending(path, ".png")
-    size = _checked_size(size)
+    size = checked_size("size", size)
     position = checked(trajectory)
     frames = len(position)
     if not isinstance(frame, int | np.integer) or not -frames <= frame < frames:
@@ -110,9 +110,7 @@ def write_mp4(
     _check_ending(path, ".mp4")
     rate = real("frames_per_second", frames_per_second, above=0.0)
     apart = 1.0 / (rate * real("slowdown", slowdown, above=0.0))
-    size = _checked_size(size)
-    if size[0] % 2 or size[1] % 2:
-        raise InputError(f"size = {size}, must be even in a movie")
+    size = checked_size("size", size, movie=True)
     imageio = _extra("imageio.v2")
     _extra("imageio_ffmpeg")
     at = _times(len(checked(trajectory)), apart / trajectory.step)
@@ -146,7 +144,7 @@ def steady_camera(trajectory: Trajectory, *, size: Sequence[int] = (1280, 960), 
     Raises:
         InputError: an argument is out of its range.
     """
-    size, at = _checked_size(size), np.arange(len(checked(trajectory)))
+    size, at = checked_size("size", size), np.arange(len(checked(trajectory)))
     return framed(trajectory, Weaving(trajectory.cloth), placed(trajectory, at), at, size, view)
 
 
@@ -254,10 +252,13 @@ def _check_ending(path: str | os.PathLike, ending: str) -> None:
         raise InputError(f"path = {str(path)!r}, must end in {ending}")
 
 
-def _checked_size(size: Sequence[int]) -> tuple[int, int]:
+def checked_size(name: str, size: Sequence[int], *, movie: bool = False) -> tuple[int, int]:
+    """Gives a width and a height in pixels, or an InputError."""
     if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
-        raise InputError(f"size = {size!r}, must be a width and a height in pixels")
-    width, height = (integer(f"size[{k}]", size[k], least=16, most=LARGEST) for k in (0, 1))
+        raise InputError(f"{name} = {size!r}, must be a width and a height in pixels")
+    width, height = (integer(f"{name}[{k}]", size[k], least=16, most=LARGEST) for k in (0, 1))
+    if movie and (width % 2 or height % 2):
+        raise InputError(f"{name} = {width, height}, must be even in a movie")
     return width, height
 
 
