@@ -143,9 +143,7 @@ def draw(rows: Sequence[dict[str, Any]]) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fabric", choices=wy.fabrics.FABRICS, default="handkerchief", help="(%(default)s)")
-    parser.add_argument(
-        "--size", type=int, default=145, help="rows and columns, 48 k + 1 (%(default)s)"
-    )
+    parser.add_argument("--size", type=int, default=145, help="rows and columns, 48 k + 1 (%(default)s)")
     parser.add_argument("--factors", type=int, nargs="+", default=FACTORS, help="n (%(default)s)")
     parser.add_argument("--steps", type=int, default=300, help="of the drape (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS / "coarse.csv", help="CSV file (%(default)s)")
