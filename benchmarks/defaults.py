@@ -36,9 +36,9 @@ import warp as wp
 from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
+from warp_yarn.description.cloth import CLOTH_NUMBERS
 from warp_yarn.device.defaults import stretch_rate
 from warp_yarn.presets.fabrics import STUDIED
-from warp_yarn.simulation.state import CLOTH_NUMBERS
 
 TIGHT = {"newton_tolerance": 1e-10, "tolerance": 1e-12}
 KINDS = ("free", "thrown", "hung", "carried", "clamped")

@@ -30,9 +30,9 @@ import warp as wp
 from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
+from warp_yarn.description.cloth import CLOTH_NUMBERS
 from warp_yarn.device.model import SOLVED
 from warp_yarn.presets.fabrics import STUDIED
-from warp_yarn.simulation.state import CLOTH_NUMBERS
 
 TOLERANCE = 1e-6
 STEP = 1e-3

@@ -9,7 +9,7 @@ import functools
 
 import warp as wp
 
-from .contact import broad_phase, limits, meshes, obstacles, self_contact
+from .contact import broad_phase, limits, meshes, obstacles, samples, self_contact
 from .core import general
 from .core.variant import Term, TermParameter, Variant
 from .linear import (
@@ -124,13 +124,14 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     kernels = {
         "contact_normal": crossing_normal.define_normal(variant),
         "update_anchor": friction.define_anchor(variant),
+        "gusty_wind": wind.define_gusty(variant),
     }
     kernels |= vars(crimped_contact.define(variant))
     for term in _OWN:
         kernels[term.name] = term.define(variant)
         if term.energy is not None:
             kernels[f"{term.name}_energy"] = term.energy(variant.forward)
-    for part in (linear, ros2):
+    for part in (linear, ros2, samples):
         kernels |= vars(part.define_reversible(variant))
     kernels |= vars(limits.define_motion(variant)) | vars(newton.define_turning(variant.forward))
     for reports in (obstacles.define_reports, meshes.define_search, self_contact.define_limits):
@@ -146,6 +147,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         newton,
         line_search,
         limits,
+        samples,
         broad_phase,
         energy_watch,
         frames,

@@ -1,13 +1,15 @@
-"""What the scenes share: a run that loses no finished frame, output files, and how a command ends."""
+"""What the scenes share: how long a run is, one that loses no finished frame, output files, and how a command ends."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,37 @@ import warp as wp
 
 import warp_yarn as wy
 from warp_yarn.description.weave import woven
-from warp_yarn.errors import integer, real
+from warp_yarn.errors import integer, missing_extra, real
 from warp_yarn.io.draft import ENDINGS
 from warp_yarn.io.files import check_writable
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.presets.fabrics import FABRICS
+from warp_yarn.simulation.pace import ROUNDING
+from warp_yarn.view.render import check_drawing
+
+MISSING: list[tuple[str, str]] = []
+"""Packages that a scene asked for and did not find, and the extras that they are of."""
+
+
+@contextlib.contextmanager
+def optional(extra: str) -> Iterator[None]:
+    """Lets a scene go on without the packages of an extra that it imports, until it is to run: --help needs none."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        MISSING.append((str(error.name), extra))
+
+
+def parse(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the options of a scene that has all that it needs.
+
+    Raises:
+        InputError: a package is missing.
+    """
+    options = parser.parse_args(arguments)
+    for package, extra in MISSING:
+        raise missing_extra(package, "this scene needs", extra)
+    return options
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,14 +70,94 @@ class Run:
             raise self.stop
 
 
-def simulate(simulator: wy.Simulator, steps: int) -> Run:
-    """Makes steps under a progress bar: Ctrl-C or a step that fails leaves every frame before it."""
-    steps, begin, stop = integer("steps", steps, least=1), time.perf_counter(), None
-    try:
-        trajectory = simulator.run(steps, progress=None)
-    except (wy.SimulationError, KeyboardInterrupt) as error:
-        trajectory, stop = simulator.trajectory or simulator.run(0), error
+def add_length(parser: argparse.ArgumentParser, steps: int) -> None:
+    """The options --steps, --seconds and --fps of a run, and --slowdown."""
+    add = parser.add_argument
+    add("--steps", type=int, help=f"how many ({steps})")
+    add("--seconds", type=number_above("--seconds", 0.0), help="of simulated time, in place of --steps")
+    text = "frames in a second of playing time; none: a frame a step. Slow motion takes more of them"
+    add("--fps", type=number_above("--fps", 0.0), metavar="N", help=text)
+    parser.set_defaults(steps_by_default=steps)
+    add_slowdown(parser)
+
+
+def settle_length(options: argparse.Namespace, step: float) -> None:
+    """Says --seconds in steps, and finds out whether --fps frames can be made of them.
+
+    Raises:
+        InputError: both are given, or there would be more frames than steps.
+    """
+    step = real("--step", step, above=0.0)
+    if options.seconds is not None:
+        if options.steps is not None:
+            raise wy.InputError(f"--steps {options.steps} and --seconds {options.seconds:g}, must be one of them")
+        options.steps = max(1, math.ceil(options.seconds / step - ROUNDING))
+    if options.steps is None:
+        options.steps = options.steps_by_default
+    integer("--steps", options.steps, least=1)
+    rate = frames_a_second(options)
+    if rate is not None and rate * step > 1.0 + ROUNDING:
+        most = 1.0 / (step * options.slowdown)
+        raise wy.InputError(
+            f"--fps {options.fps:g} at --slowdown {options.slowdown:g}, must be at most {most:g}: a frame a step of "
+            f"{step:g} s"
+        )
+
+
+def frames_a_second(options: argparse.Namespace) -> float | None:
+    """Of simulated time, which plays slower; None: a frame a step."""
+    return None if options.fps is None else options.fps * options.slowdown
+
+
+def simulate(
+    simulator: wy.Simulator,
+    options: argparse.Namespace,
+    files: Sequence[Path | None] = (),
+    *,
+    steps: int | None = None,
+    after: Path | None = None,
+) -> Run:
+    """Makes steps under a progress bar, and writes files as the frames come: Ctrl-C, SIGTERM, a full disk or a step
+    that fails leaves every frame before it.
+
+    Args:
+        options: of ``add_length``.
+        files: USD files and recordings, those that are given.
+        steps: in place of those of the options.
+        after: the recording that the run goes on from, whose frames come first.
+    """
+    begin, stop = time.perf_counter(), None
+    given = [path for path in files if path is not None]
+    with tempfile.TemporaryDirectory(prefix="warp_yarn-", ignore_cleanup_errors=True) as folder:
+        # what is looked at afterwards, pictures among it, is read from a recording
+        kept = next((path for path in given if path.suffix in RECORDINGS), Path(folder) / "frames.npz")
+        paths = given if kept in given else [*given, kept]
+        try:
+            simulator.record(
+                *paths,
+                steps=options.steps if steps is None else steps,
+                fps=frames_a_second(options),
+                after=after,
+                slowdown=options.slowdown,
+                tubes=getattr(options, "tubes", False),
+                progress=None,
+            )
+        except (wy.SimulationError, KeyboardInterrupt, OSError) as error:
+            stop = error
+        there = kept.exists()
+        trajectory = wy.Trajectory.load(kept) if there else simulator.run(0)
+        if isinstance(stop, wy.SimulationError):
+            stop.trajectory = trajectory
+        if isinstance(stop, OSError) and there and kept.parent == Path(folder):
+            rescue(trajectory)
     return Run(trajectory, time.perf_counter() - begin, stop)
+
+
+def rescue(trajectory: wy.Trajectory) -> None:
+    """Saves frames where temporary files go, and says so."""
+    path = Path(tempfile.mkdtemp(prefix="warp_yarn-")) / "frames.npz"
+    trajectory.save(path)
+    print(f"All frames are kept in {path}, for --resume and Trajectory.load.", file=sys.stderr)
 
 
 def write_all(trajectory: wy.Trajectory, *writers: Callable[[], None]) -> None:
@@ -64,10 +173,20 @@ def write_all(trajectory: wy.Trajectory, *writers: Callable[[], None]) -> None:
         except OSError as error:
             failures.append(error)
     if failures:
-        rescue = Path(tempfile.mkdtemp(prefix="warp_yarn-")) / "frames.npz"
-        trajectory.save(rescue)
-        print(f"All frames are kept in {rescue}, for --resume and Trajectory.load.", file=sys.stderr)
+        rescue(trajectory)
         raise failures[0]
+
+
+def draw(run: Run, options: argparse.Namespace, **picture: Any) -> None:
+    """Draws what --png and --mp4 ask for."""
+    writers, trajectory = [], run.trajectory
+    if options.png is not None:
+        writers.append(lambda: wy.write_png(options.png, trajectory, **picture))
+    if options.mp4 is not None:
+        rate = {} if options.fps is None else {"frames_per_second": options.fps}
+        slow = {"slowdown": options.slowdown, **rate}
+        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, progress=None, **slow))
+    write_all(trajectory, *writers)
 
 
 def read_number(name: str, text: str, **allowed: float) -> float:
@@ -124,14 +243,32 @@ def woven_cloth(fabric: str, options: argparse.Namespace, rows: int, columns: in
     return draft.dyed(cloth) if colored else cloth
 
 
+def number_above(name: str, least: float) -> Callable[[str], float]:
+    """An argparse type: a number above another. argparse would not say which numbers are."""
+
+    def number(text: str) -> float:
+        try:
+            return read_number(name, text, above=least)
+        except wy.InputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return number
+
+
 def add_slowdown(parser: argparse.ArgumentParser) -> None:
     """The option --slowdown of what is written to be played."""
-
-    def positive(text: str) -> float:
-        return read_number("--slowdown", text, above=0.0)
-
     text = "seconds of playing time for one of simulated time, in files (%(default)g)"
-    parser.add_argument("--slowdown", type=positive, default=20.0, metavar="FACTOR", help=text)
+    parser.add_argument("--slowdown", type=number_above("--slowdown", 0.0), default=20.0, metavar="FACTOR", help=text)
+
+
+def check_pictures(png: Path | None, mp4: Path | None) -> None:
+    """Finds out before a run whether pictures and movies that are asked for can be drawn.
+
+    Raises:
+        InputError: they cannot.
+    """
+    if png is not None or mp4 is not None:
+        check_drawing(movies=mp4 is not None)
 
 
 def make_folders(paths: Sequence[Path | None]) -> None:

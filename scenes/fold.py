@@ -16,10 +16,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import touch
-from common import Run, command, simulate
+from common import Run, command, frames_a_second, simulate, write_all
 
 import warp_yarn as wy
 from warp_yarn.errors import integer
+from warp_yarn.simulation.pace import Pace, every_of
 from warp_yarn.simulation.state import FIELDS
 
 SHORT = 2.0
@@ -67,14 +68,41 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     cloth = touch.raised(touch.flat(options), 0.0)
     pins, path = carried(cloth, options.fold)
     held = touch.scene(cloth, options, obstacles=table, pins=pins, pin_path=path)
-    first = simulate(touch.simulator(held, options), options.fold)
+    each_step = argparse.Namespace(**{**vars(options), "fps": None})
+    first = simulate(touch.simulator(held, options), each_step, steps=options.fold)
     made = first
     if first.stop is None:
         simulator = touch.simulator(held.replace(pins=(), pin_path=None), options)
         simulator.state = first.trajectory[-1]
-        second = simulate(simulator, options.steps)
+        second = simulate(simulator, each_step)
         made = Run(joined(first.trajectory, second.trajectory), first.seconds + second.seconds, second.stop)
+    made = dataclasses.replace(made, trajectory=filmed(made.trajectory, options))
+    write(made.trajectory, options)
     return touch.finish(made, options, thickness(made.trajectory))
+
+
+def filmed(trajectory: wy.Trajectory, options: argparse.Namespace) -> wy.Trajectory:
+    """The frames that --fps asks for, of a trajectory of every step; between two steps on a straight line."""
+    rate = frames_a_second(options)
+    if rate is None:
+        return trajectory
+    every = every_of(rate, trajectory.step)
+    places = Pace.of(trajectory.step, len(trajectory) - 1, None, every).places()
+    before = places.astype(int)
+    after, share = np.minimum(before + 1, len(trajectory) - 1), (places - before)[:, None, None]
+    parts = {}
+    for name in FIELDS:
+        values = getattr(trajectory, name)
+        parts[name] = values[before] + share * (values[after] - values[before])
+    return dataclasses.replace(trajectory, **parts, step=every * trajectory.step, every=every)
+
+
+def write(trajectory: wy.Trajectory, options: argparse.Namespace) -> None:
+    """The files of both scenes, which are one to whoever looks."""
+    writers = [lambda: wy.write_usd(options.output, trajectory, tubes=options.tubes, slowdown=options.slowdown)]
+    if options.record is not None:
+        writers.insert(0, lambda: trajectory.save(options.record))
+    write_all(trajectory, *writers)
 
 
 def thickness(trajectory: wy.Trajectory) -> str:

@@ -4,6 +4,7 @@ python scenes/hang.py                                     the paper's, 17 × 17,
 python scenes/hang.py --fabric handkerchief               one that you might have at hand
 python scenes/hang.py --size 31 --weave twill --yarns 1 3 --png out/hang.png --mp4 out/hang.mp4
 python scenes/hang.py --weave "3/1 twill S"               as weavers say it; or --draft FILE.wif, as they draw it
+python scenes/hang.py --seconds 2 --fps 24                a film: 24 frames a second of playing time, slowed down
 python scenes/hang.py --record out/hang.npz               and later, to go on from there:
 python scenes/hang.py --resume out/hang.npz --steps 500 --output out/both.usdc
 """
@@ -14,11 +15,25 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from common import Run, add_slowdown, add_weave, command, file_ending, make_folders, simulate, woven_cloth, write_all
+from common import (
+    Run,
+    add_length,
+    add_weave,
+    check_pictures,
+    command,
+    draw,
+    file_ending,
+    make_folders,
+    settle_length,
+    simulate,
+    woven_cloth,
+)
 
 import warp_yarn as wy
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -39,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
     add_weave(result)
     add("--yarns", type=int, nargs=2, metavar=("EVEN", "ODD"), help="two of the paper's yarns 1, 2 and 3 (1 2)")
     add("--wind", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m/s (0 5 0)")
-    add("--steps", type=int, default=paper.STEPS, help="how many (%(default)s)")
+    add_length(result, paper.STEPS)
     add("--step", type=float, metavar="SECONDS", help=f"time step ({paper.STEP:g})")
     add(
         "--locked",
@@ -49,11 +64,12 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--output", type=file_ending(*ENDINGS), default=Path("out/hang.usdc"), metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
-    add_slowdown(result)
     add("--png", type=file_ending(".png"), metavar="FILE", help="a picture of the last frame")
     add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
-    add("--record", type=file_ending(".npz"), metavar="FILE", help="every frame, for --resume and for NumPy")
-    add("--resume", type=file_ending(".npz"), metavar="FILE", help="go on from the last frame of a recording")
+    text = "the frames as numbers (.npz, .h5), for --resume and wy.Trajectory.load"
+    add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
+    text = "go on from the end of a recording, at its frames a second"
+    add("--resume", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     return result
 
 
@@ -65,21 +81,18 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = parser().parse_args(arguments)
+    simulator = resumed(options) if options.resume is not None else wy.Simulator(**chosen(options))
+    settle_length(options, simulator.step_size)
     make_folders([options.output, options.png, options.mp4, options.record])
-    earlier = None if options.resume is None else wy.Trajectory.load(options.resume)
-    scene, step = chosen(options) if earlier is None else recorded(options, earlier)
-    simulator = wy.Simulator(scene, step=step)
-    if earlier is not None:
-        simulator.state, simulator.steps_done = earlier[-1], earlier.steps_done
-    run = simulate(simulator, options.steps)
-    trajectory = run.trajectory if earlier is None else earlier.joined(run.trajectory)
-    write(trajectory, options)
-    tell(trajectory, run, options)
+    check_pictures(options.png, options.mp4)
+    run = simulate(simulator, options, [options.output, options.record], after=options.resume)
+    draw(run, options)
+    tell(run, options)
     run.end()
-    return trajectory
+    return run.trajectory
 
 
-def chosen(options: argparse.Namespace) -> tuple[wy.Scene, float]:
+def chosen(options: argparse.Namespace) -> dict[str, Any]:
     """The scene and the time step that the options name."""
     size = 17 if options.size is None else options.size
     rows = size if options.rows is None else options.rows
@@ -91,33 +104,20 @@ def chosen(options: argparse.Namespace) -> tuple[wy.Scene, float]:
     yarns = {} if options.yarns is None else {"yarns": options.yarns}
     cloth = woven_cloth(fabric, options, rows, columns, **yarns)
     wind = wy.Wind(velocity=tuple(options.wind or paper.WIND))
-    return paper.hung(cloth, wind=wind, sliding=not options.locked), step
+    return {"scene": paper.hung(cloth, wind=wind, sliding=not options.locked), "step": step}
 
 
-def recorded(options: argparse.Namespace, earlier: wy.Trajectory) -> tuple[wy.Scene, float]:
-    """Those of the recording."""
+def resumed(options: argparse.Namespace) -> wy.Simulator:
+    """A simulator at the end of the recording."""
     for name in OF_THE_RECORDING:
         if getattr(options, name) is not None:
             raise wy.InputError(f"--{name} does not go with --resume: {options.resume} has its own")
-    if earlier.scene is None:
-        raise wy.InputError(f"{options.resume}: has no scene to go on with; it was recorded by an older warp_yarn")
-    return earlier.scene, earlier.step
+    return wy.Simulator.resumed(options.resume)
 
 
-def write(trajectory: wy.Trajectory, options: argparse.Namespace) -> None:
-    """The output files, those first that need the least."""
-    writers = [lambda: wy.write_usd(options.output, trajectory, tubes=options.tubes, slowdown=options.slowdown)]
-    if options.record is not None:
-        writers.insert(0, lambda: trajectory.save(options.record))
-    if options.png is not None:
-        writers.append(lambda: wy.write_png(options.png, trajectory))
-    if options.mp4 is not None:
-        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
-    write_all(trajectory, *writers)
-
-
-def tell(trajectory: wy.Trajectory, run: Run, options: argparse.Namespace) -> None:
+def tell(run: Run, options: argparse.Namespace) -> None:
     """A few lines about what was made."""
+    trajectory = run.trajectory
     weave = trajectory.cloth.weave
     sliding = np.abs(trajectory.euler - trajectory.cloth.euler).max()
     print(f"{weave.rows} × {weave.columns} yarns, {weave.name}: {len(trajectory)} frames, in {run.seconds:.2g} s")

@@ -22,16 +22,20 @@ from typing import Any
 
 import numpy as np
 import tqdm
-from common import add_slowdown, file_ending, make_folders, write_all
-from matplotlib.figure import Figure
+from common import add_slowdown, check_pictures, file_ending, make_folders, optional, parse, write_all
 
 import warp_yarn as wy
-from warp_yarn.envs import box, throws
+from warp_yarn.envs import box
 from warp_yarn.errors import integer
 from warp_yarn.io.files import atomic_write
 from warp_yarn.io.usd import ENDINGS
 
-POLICIES = {"forces": throws.Forces, "network": throws.Network}
+with optional("torch"):
+    from warp_yarn.envs import throws
+with optional("bench"):
+    from matplotlib.figure import Figure
+
+POLICIES = {"forces": "Forces", "network": "Network"}
 SHOWN = (0, 30, 60, 90, 120, box.STEPS)
 """Frames in the picture."""
 VIEW = (-0.3, -1.0, 1.2)
@@ -65,13 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         InputError: an option that cannot be used.
         KeyboardInterrupt: after the best throw before was written.
     """
-    options = parser().parse_args(arguments)
+    options = parse(parser(), arguments)
     integer("--epochs", options.epochs, least=1)
     integer("--seed", options.seed, least=0)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
     make_folders([options.output, options.plot, options.result, options.png])
-    policy = POLICIES[options.learn](options.seed)
+    check_pictures(options.png, None)
+    policy = getattr(throws, POLICIES[options.learn])(options.seed)
     found: list[throws.Epoch] = []
     stop: BaseException | None = None
     try:

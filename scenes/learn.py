@@ -6,7 +6,7 @@ python scenes/learn.py out/hang.npz --parameters bend[0] bend[1] shear --frames 
 python scenes/learn.py out/hang.npz --parameters wind_drag --range wind_drag 0 2 --start wind_drag 1
 python scenes/learn.py wind_plain_12_5x5.h5 --step 2.5e-4
 
-FILE is a recording (.npz, of hang.py --record or Trajectory.save) or one of the paper's published HDF5 files. Cloth,
+FILE is a recording (of hang.py --record or Trajectory.save) or one of the paper's published HDF5 files. Cloth,
 weave and yarns are those of the file, and so is what is not learned. What is learned begins at its start, not at the
 file's value; the plot shows both. .json: values, uncertainties, correlations and every iteration. .png: the path of
 each parameter through its range. .usdc: the data and, at their right, the model with what it has learned.
@@ -27,18 +27,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_slowdown, command, file_ending, make_folders, read_number
-from matplotlib.figure import Figure
+from common import add_slowdown, command, file_ending, make_folders, optional, parse, read_number
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 import warp_yarn as wy
-from warp_yarn.calibration.learn import PAPER, CalibrationProblem, Parameter, Result, learn, learnable, split, value_of
 from warp_yarn.errors import integer
 from warp_yarn.integrators import INTEGRATORS
+from warp_yarn.io import recordings
 from warp_yarn.io.files import atomic_write
-from warp_yarn.io.usd import ENDINGS, reload, writing
+from warp_yarn.io.usd import LAYERS, reload, writing
 from warp_yarn.presets import paper
 from warp_yarn.simulation.state import FIELDS
+
+with optional("torch"):
+    from warp_yarn.calibration.learn import (
+        PAPER,
+        CalibrationProblem,
+        Parameter,
+        Result,
+        learn,
+        learnable,
+        split,
+        value_of,
+    )
+with optional("bench"):
+    from matplotlib.figure import Figure
 
 HDF5 = (".h5", ".hdf5")
 
@@ -67,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
     add("--iterations", type=int, default=100, help="at most (%(default)s)")
     add("--resolution", type=float, default=1e-9, metavar="METRES", help="of the data, at best (%(default)g)")
     add("--resume", action="store_true", help="go on where the same command was stopped")
-    add("--output", type=file_ending(*ENDINGS), default=Path("out/learn.usdc"), metavar="USD", help="(%(default)s)")
+    add("--output", type=file_ending(*LAYERS), default=Path("out/learn.usdc"), metavar="USD", help="(%(default)s)")
     add("--plot", type=file_ending(".png"), metavar="PNG", help="(the USD file's name, .png)")
     add("--result", type=file_ending(".json"), metavar="JSON", help="(the USD file's name, .json)")
     add_slowdown(result)
@@ -85,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         SimulationError: the start values, or the motion with the learned ones, cannot be simulated.
         KeyboardInterrupt: Ctrl-C, after saying how to go on.
     """
-    options = parser().parse_args(arguments)
+    options = parse(parser(), arguments)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
     checkpoint = options.output.with_suffix(".checkpoint.npz")
@@ -132,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
 
 def read(options: argparse.Namespace) -> tuple[wy.Scene, wy.Trajectory]:
     """The scene and the frames of the file; which of them to take is settled."""
-    if options.file.suffix in HDF5:
+    if options.file.suffix in HDF5 and not recordings.is_one(options.file):
         if options.wind is not None:
             raise wy.InputError(f"--wind does not go with {options.file}, which has its own")
         published = wy.read_published(options.file)

@@ -16,7 +16,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from common import add_slowdown, command, file_ending, make_folders, simulate, write_all
+from common import add_slowdown, command, file_ending, make_folders, simulate
 
 import warp_yarn as wy
 from warp_yarn.io.usd import ENDINGS
@@ -35,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, float]:
     parser.add_argument("file", help="an HDF5 file of the paper's published data")
     parser.add_argument("--usd", type=file_ending(*ENDINGS), metavar="FILE", help="write the simulated motion")
     add_slowdown(parser)
+    parser.set_defaults(fps=None)
     options = parser.parse_args(arguments)
     make_folders([options.usd])
     published = wy.read_published(options.file)
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, float]:
     simulator = wy.Simulator(published.scene, step=frames.step, integrator="linear")
     simulator.state = frames[1]
     last = len(frames) - 1
-    run = simulate(simulator, last - 1)
+    run = simulate(simulator, options, [options.usd], steps=last - 1)
     relative = {}
     print("frame  error [µm]  displacement [µm]   relative")
     for frame, position in enumerate(run.trajectory.position[1:], start=2):
@@ -52,7 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, float]:
             relative[frame] = error / displacement
             print(f"{frame:5d} {1e6 * error:11.1f} {1e6 * displacement:18.1f} {100.0 * relative[frame]:8.1f} %")
     if options.usd is not None:
-        write_all(run.trajectory, lambda: wy.write_usd(options.usd, run.trajectory, slowdown=options.slowdown))
         print("written:", options.usd)
     run.end()
     return relative

@@ -20,13 +20,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import command, file_ending, make_folders
-from matplotlib.figure import Figure
+from common import command, file_ending, make_folders, optional, parse
 
 import warp_yarn as wy
 from warp_yarn.errors import integer, real
 from warp_yarn.io.files import atomic_write
 from warp_yarn.presets import paper
+
+with optional("bench"):
+    from matplotlib.figure import Figure
 
 DAMPING = 1e-4
 """d_f [N s/m]: 1e-6 N at 1 cm/s, under a hundredth of what a crossing sticks with. The paper's 1000 would hide it."""
@@ -160,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Pull]:
         InputError: an option that cannot be used.
         SimulationError: a step that could not be made.
     """
-    options = parser().parse_args(arguments)
+    options = parse(parser(), arguments)
     make_folders([options.png, options.csv])
     size = integer("--size", options.size, least=4)
     motion = {name: real(f"--{name}", getattr(options, name), above=0.0) for name in ("speed", "distance", "step")}

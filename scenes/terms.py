@@ -19,13 +19,15 @@ from __future__ import annotations
 import argparse
 import runpy
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from common import command
 
 import warp_yarn as wy
-from warp_yarn.errors import integer
+from warp_yarn.errors import brief, integer
 from warp_yarn.integrators import INTEGRATORS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -75,10 +77,37 @@ def chosen(options: argparse.Namespace) -> tuple[wy.Scene, wy.State | None]:
             raise wy.InputError(f"--{name} does not go with a file: {options.file} has its own cloth")
     if not options.file.is_file():
         raise wy.InputError(f"{options.file}: there is no such file")
-    names = runpy.run_path(str(options.file))
-    if not isinstance(names.get("scene"), wy.Scene):
+    names = names_set_by(options.file)
+    scene, state = names.get("scene"), names.get("state")
+    if not isinstance(scene, wy.Scene):
         raise wy.InputError(f"{options.file}: must set `scene` to a warp_yarn.Scene")
-    return names["scene"], names.get("state")
+    if not isinstance(state, wy.State | None):
+        raise wy.InputError(f"{options.file}: sets `state` to {brief(state)}, must be a warp_yarn.State")
+    return scene, state
+
+
+def names_set_by(file: Path) -> dict[str, Any]:
+    """What a Python file sets.
+
+    Raises:
+        InputError: it is none, or fails: with the line.
+    """
+    try:
+        return runpy.run_path(str(file))
+    except (SyntaxError, ValueError) as error:  # ValueError: of bytes that are no text
+        if isinstance(error, wy.InputError):
+            raise wy.InputError(f"{file}{line_of(error, file)}: {error}") from error
+        if isinstance(error, SyntaxError) or not line_of(error, file):
+            raise wy.InputError(f"{file}: is no Python file that sets `scene` ({error})") from error
+        raise wy.InputError(f"{file}{line_of(error, file)}: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:
+        raise wy.InputError(f"{file}{line_of(error, file)}: {type(error).__name__}: {error}") from error
+
+
+def line_of(error: BaseException, file: Path) -> str:
+    """Where in a file it was raised, or nothing."""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
+    return f", line {lines[-1]}" if lines else ""
 
 
 if __name__ == "__main__":

@@ -22,17 +22,21 @@ from typing import Any
 
 import into_box
 import numpy as np
-import torch
 import tqdm
-from common import add_slowdown, add_weave, command, file_ending, make_folders, woven_cloth, write_all
-from matplotlib.figure import Figure
+from common import add_slowdown, add_weave, command, file_ending, make_folders, optional, parse, woven_cloth, write_all
 
 import warp_yarn as wy
-import warp_yarn.torch as wt
 from warp_yarn.errors import finite_array, integer, real
 from warp_yarn.io.files import atomic_write
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets.fabrics import FABRICS
+
+with optional("torch"):
+    import torch
+
+    import warp_yarn.torch as wt
+with optional("bench"):
+    from matplotlib.figure import Figure
 
 GRAVITY = np.array([0.0, 0.0, -9.8])
 
@@ -233,7 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     """
     if "--box" in (sys.argv[1:] if arguments is None else arguments):
         return into_box.main(arguments)
-    options = parser().parse_args(arguments)
+    options = parse(parser(), arguments)
     options.plot = options.plot or options.output.with_suffix(".png")
     options.result = options.result or options.output.with_suffix(".json")
     integer("--iterations", options.iterations, least=1)

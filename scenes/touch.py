@@ -11,18 +11,20 @@ from pathlib import Path
 import numpy as np
 from common import (
     Run,
-    add_slowdown,
+    add_length,
     add_weave,
+    check_pictures,
+    draw,
     file_ending,
     make_folders,
-    read_number,
+    number_above,
+    settle_length,
     simulate,
     woven_cloth,
-    write_all,
 )
 
 import warp_yarn as wy
-from warp_yarn.errors import integer
+from warp_yarn.io.films import RECORDINGS
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -44,34 +46,33 @@ def parser(text: str | None, name: str, *, rows: int, columns: int, steps: int) 
     add_weave(result)
     add("--friction", type=float, default=0.3, metavar="MU", help="of all that touches (%(default)s)")
     add("--integrator", choices=INTEGRATORS, default="implicit-euler", help="(%(default)s)")
-    add("--steps", type=int, default=steps, help="how many (%(default)s)")
+    add_length(result, steps)
     add("--step", type=float, default=paper.STEP, metavar="SECONDS", help="time step (%(default)g)")
     add("--seed", type=int, help="starts with every node up to 1 %% of the spacing elsewhere, by chance")
     add("--locked", action="store_true", help="yarns do not slide along each other")
     output = Path(f"out/{name}.usdc")
     add("--output", type=file_ending(*ENDINGS), default=output, metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
-    add_slowdown(result)
     add("--png", type=file_ending(".png"), metavar="FILE", help="a picture of the last frame")
     add("--mp4", type=file_ending(".mp4"), metavar="FILE", help="a movie")
-    add("--record", type=file_ending(".npz"), metavar="FILE", help="every frame, for NumPy")
+    text = "the frames as numbers (.npz, .h5), for wy.Trajectory.load"
+    add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
     return result
 
 
 def add_positive(parser: argparse.ArgumentParser, name: str, value: float, text: str) -> None:
     """An option that is a number above 0."""
-
-    def positive(typed: str) -> float:
-        return read_number(name, typed, above=0.0)
-
-    parser.add_argument(name, type=positive, default=value, metavar="NUMBER", help=f"{text} (%(default)g)")
+    parser.add_argument(
+        name, type=number_above(name, 0.0), default=value, metavar="NUMBER", help=f"{text} (%(default)g)"
+    )
 
 
 def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """The options, once it is known that all files can be written."""
     options = of.parse_args(arguments)
-    integer("--steps", options.steps, least=1)
+    settle_length(options, options.step)
     make_folders([options.output, options.png, options.mp4, options.record])
+    check_pictures(options.png, options.mp4)
     return options
 
 
@@ -105,25 +106,18 @@ def simulator(scene: wy.Scene, options: argparse.Namespace) -> wy.Simulator:
 
 
 def run(scene: wy.Scene, options: argparse.Namespace) -> Run:
-    """Makes the steps."""
-    return simulate(simulator(scene, options), options.steps)
+    """Makes the steps, and writes them."""
+    return simulate(simulator(scene, options), options, [options.output, options.record])
 
 
 def finish(run: Run, options: argparse.Namespace, *told: str) -> wy.Trajectory:
-    """Writes the files, those first that need the least, tells, and looks at every frame.
+    """Draws pictures, tells, and looks at every frame.
 
     Raises:
         SimulationError: what ended the run early, or something came nearer than it may.
     """
     trajectory = run.trajectory
-    writers = [lambda: wy.write_usd(options.output, trajectory, tubes=options.tubes, slowdown=options.slowdown)]
-    if options.record is not None:
-        writers.insert(0, lambda: trajectory.save(options.record))
-    if options.png is not None:
-        writers.append(lambda: wy.write_png(options.png, trajectory, size=(960, 720)))
-    if options.mp4 is not None:
-        writers.append(lambda: wy.write_mp4(options.mp4, trajectory, slowdown=options.slowdown, progress=True))
-    write_all(trajectory, *writers)
+    draw(run, options, size=(960, 720))
     cloth = trajectory.cloth
     for weave in [each.weave for each in (cloth.cloths if isinstance(cloth, wy.Cloths) else [cloth])]:
         print(f"{weave.rows} × {weave.columns} yarns, {weave.name}")

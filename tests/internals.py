@@ -18,6 +18,7 @@ from warp_yarn.device.contact import Near
 from warp_yarn.device.impact_zones import Projected
 from warp_yarn.integrators.newton import Newton
 from warp_yarn.simulation import ablation, checks
+from warp_yarn.simulation.inspection import with_room
 from warp_yarn.simulation.linear_system import read_system
 from warp_yarn.view import render
 
@@ -98,9 +99,22 @@ def near_faces(simulator: wy.Simulator) -> Near:
     return simulator.model.contact.near_faces()
 
 
+def near_pairs(simulator: wy.Simulator) -> Near:
+    """Every two samples that are near each other, with room for all of them."""
+    with_room(simulator.stepper, simulator.model.contact.find)
+    return simulator.model.contact.near_pairs()
+
+
 def near_room(simulator: wy.Simulator) -> int:
     """Places of a node in the list of what is near."""
     return int(simulator.arrays["near_room"])
+
+
+def set_near_room(simulator: wy.Simulator, room: int) -> None:
+    """Leaves a sample so many places for what is near it."""
+    simulator.model.contact.make_room(room)
+    simulator.integrator.forget_graphs()
+    simulator.stepper.substepping.forget_graphs()
 
 
 def obstacles_begin_a_step(simulator: wy.Simulator) -> None:
@@ -152,6 +166,10 @@ def left_of_the_last_stage(simulator: wy.Simulator) -> float:
     return np.sqrt(slope) / change / newton_tolerance(simulator, simulator.step_size)
 
 
+def watches_energy(simulator: wy.Simulator) -> bool:
+    return simulator.model.energy.on
+
+
 def fails_at_first(simulator: wy.Simulator, largest: float) -> None:
     """Makes a simulator fail in its first step, wherever it tries more of it at once than so much [s]."""
     advance, arrays = simulator.integrator.advance, simulator.arrays
@@ -185,8 +203,8 @@ def gain_in_a_part(simulator: wy.Simulator, size: float, left: float) -> list[fl
     substepping, gained = simulator.substepping, []
     attempt = substepping._try
 
-    def made(method: object, count: Callable[[], None], *part: float) -> bool:
-        good = attempt(method, count, *part)
+    def made(method: object, count: Callable[[], None], make_room: Callable[[], None], *part: float) -> bool:
+        good = attempt(method, count, make_room, *part)
         if method is simulator.integrator and part == (size, left):
             put(simulator, "status", [GAINED, -1, 0])
             gained.append(size)
@@ -255,9 +273,8 @@ def locks_taken() -> list[object]:
 
 halved: Callable = ablation._halved
 unneeded: Callable = ablation._unneeded
-resampled: Callable = render._resampled
-pyvista: Callable = render._pyvista
-Camera, Picture = render._Camera, render._Picture
+picture_times: Callable = render._times
+Picture = render._Picture
 
 
 def resolved_with_its_adjoint(
@@ -271,3 +288,8 @@ def resolved_with_its_adjoint(
     made = Projected(rounds, start, inverse_mass, np.zeros(0), found - end, 1.0)
     to_start, to_end, _ = zones.taken_back(made, adjoint)
     return found, to_start, to_end, active
+
+
+def room_for_near(simulator: wy.Simulator) -> int:
+    """Places of each node in the list of what is near."""
+    return simulator.arrays["near_room"]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from internals import near_room, set_near_room
 from touching import GROUND, folded, lifted, paper
 
 import warp_yarn as wy
@@ -145,6 +146,50 @@ def test_self_contact(method: str, names: tuple[str, ...]) -> None:
     scene = wy.Scene(folded(), obstacles=[GROUND], self_contact=True)
     rollout = wt.Rollout(scene, STEPS, integrator=method, checkpoint_every=16, **EXACT)
     check_derivatives(rollout, names)
+
+
+@pytest.mark.parametrize("samples", ["nodes", "nodes+mids"])
+def test_room_grows_on_the_way_back(samples: str) -> None:
+    """Where a list is made that the run did not make: the bits are those of enough room."""
+    scene = wy.Scene(folded(), obstacles=[GROUND], self_contact=True, contact=wy.Contact(samples=samples))
+    rollout, results = wt.Rollout(scene, 30, integrator="implicit-euler"), []
+    for room in (64, 1):
+        velocity = rollout.defaults["velocity"].clone().requires_grad_()
+        stiffness = rollout.defaults["self_contact_stiffness"].clone().requires_grad_()
+        position = rollout(velocity=velocity, self_contact_stiffness=stiffness).last.position
+        set_near_room(rollout.simulator, room)
+        (position * torch.linspace(-1.0, 1.0, position.numel(), dtype=torch.float64).view_as(position)).sum().backward()
+        assert near_room(rollout.simulator) > 1
+        results.append((velocity.grad, stiffness.grad))
+    assert all(torch.equal(*both) for both in zip(*results, strict=True))
+
+
+MIDS = wy.Contact(samples="nodes+mids")
+SMALL = ("friction", "yarn_stretch")
+OF_MIDS = tuple(name for name in ALL if name not in SMALL)
+"""Friction and stretch of the yarns do a thousandth of the others, as little as kinks and what Newton's iteration
+leaves do to differences."""
+
+
+@pytest.mark.parametrize(
+    ("method", "names"),
+    [
+        ("implicit-euler", ("self_contact_stiffness", "obstacle_friction", "velocity")),
+        *(pytest.param(m, (*OF_MIDS, "obstacle_friction"), marks=pytest.mark.slow) for m in METHODS),
+    ],
+)
+def test_middles_that_touch(method: str, names: tuple[str, ...]) -> None:
+    scene = wy.Scene(folded(), obstacles=[GROUND], self_contact=True, contact=MIDS)
+    check_derivatives(wt.Rollout(scene, STEPS // 2, integrator=method, **EXACT), names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_middles_on_obstacles(method: str) -> None:
+    """A mesh among them."""
+    names = (*OBSTACLE_LAW, "obstacle_size", "obstacle_position", "obstacle_rotation", *STATE, *FABRIC)
+    names = tuple(name for name in names if name not in SMALL)
+    check_derivatives(wt.Rollout(drop().replace(contact=MIDS), STEPS, integrator=method, **EXACT), names)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import inspect
+import linecache
 import re
 import shutil
 import tomllib
@@ -15,7 +16,7 @@ import warp_yarn as wy
 from warp_yarn.description.topology import Topology
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def anchors(text: str) -> set[str]:
@@ -124,3 +125,21 @@ def test_the_package_says_its_version_and_that_it_has_types():
     assert project["tool"]["setuptools"]["package-data"]["warp_yarn"] == ["py.typed"]
     assert (ROOT / "warp_yarn" / "py.typed").exists()
     assert f"## {wy.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_code_of_forces_md_runs():
+    """Block after block, and it says what it says."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "forces.md").read_text(), flags=re.M | re.S)
+    assert len(blocks) == 4
+    names: dict[str, object] = {}
+    for k, block in enumerate(blocks):
+        # a wp.func needs a file of its source
+        source = f"docs/forces.md, block {k}"
+        linecache.cache[source] = (len(block), None, block.splitlines(keepends=True), source)
+        exec(compile(block, source, "exec"), names)
+        if k == 0:
+            assert names["found"].reactions[5:, 1].sum() == pytest.approx(2.0, abs=5e-3)
+        if k == 1:
+            # stiffer yarns sag less
+            assert names["stretch"].grad.item() > 0.0
+    assert len(names["pulls"]) == 9

@@ -344,7 +344,7 @@ def test_gymnasium_is_asked_for_by_name_where_it_is_missing():
         "envs.ThrowIntoBox\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert "environments need gymnasium: pip install warp_yarn[rl]" in done.stderr
+    assert "gymnasium is not installed, which environments need: pip install" in done.stderr
 
 
 # -- the gradient -----------------------------------------------------------------------------------------------------

@@ -361,13 +361,28 @@ def test_recordings(tmp_path) -> None:
 
 
 def test_yarns_are_drawn_at_their_sizes() -> None:
-    """A warp yarn passes under by half its own thickness, a weft yarn over by its own."""
-    from warp_yarn.view.geometry import strands
+    """A warp yarn passes under by half its own thickness, a weft yarn over by its own; its section is its own too."""
+    from warp_yarn.view.yarns import Weaving
 
     c = cloth("general")
-    run = wy.Simulator(wy.Scene(c)).run(0)
-    parts = strands(run)
-    assert [part.radius for part in parts] == pytest.approx([1.7e-4, 2.7e-4, 3.2e-4])
-    for part in parts:
-        height = np.abs(part.points[0, :, 2])
-        assert height.max() == pytest.approx(part.radius) and height.min() == 0.0
+    weaving = Weaving(c)
+    assert [part.half[0, 1] for part in weaving.strands] == pytest.approx([1.7e-4, 2.7e-4, 3.2e-4])
+    for part in weaving.strands:
+        np.testing.assert_array_equal(part.half, c.halves[part.yarn])
+        height = np.abs(part.points(*weaving.look(c.position))[:, 2])
+        # 0 of free ends alone
+        assert height.max() == pytest.approx(part.half[0, 1]) and (height > 0.0).sum() == (part.places < c.nodes).sum()
+
+
+def test_crimped_yarns_are_drawn_as_far_apart_as_they_are() -> None:
+    """Crimp makes the arcs along yarns longer, and nothing of what is drawn other than it is without."""
+    from warp_yarn.view.yarns import Tubes, Weaving
+
+    crimped = cloth("general").replace(crimp=(0.3, 0.1))
+    plain, long = (Weaving(c, selvedge=True) for c in (crimped.replace(crimp=0.0), crimped))
+    for one, other in zip(plain.look(crimped.position), long.look(crimped.position), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(Weaving(crimped.replace(crimp=0.0)).strands, Weaving(crimped).strands, strict=True):
+        crimp = np.repeat(other.crimp, other.counts)
+        np.testing.assert_allclose(other.arc, (1.0 + crimp) * one.arc, rtol=1e-12)
+        np.testing.assert_allclose(*(Tubes.around(each, samples=4).half for each in (one, other)), rtol=1e-6)

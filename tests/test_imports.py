@@ -26,6 +26,7 @@ FORBIDDEN = {
     f"{K}.nonlinear": {f"{K}.{room}" for room in ("terms", "linear", "stepping", "contact")},
     f"{K}.stepping": {f"{K}.terms", f"{K}.contact"},
     f"{K}.contact": {f"{K}.{room}" for room in ("terms", "nonlinear", "stepping")},
+    f"{K}.drawing": {f"{K}.{room}" for room in ("core", "terms", "linear", "nonlinear", "stepping", "contact")},
     f"{W}.description": {
         "warp", f"{W}.device", f"{W}.simulation", f"{W}.integrators", f"{W}.gradients", f"{W}.calibration", f"{W}.io",
         f"{W}.view", f"{W}.presets",
@@ -47,16 +48,16 @@ ONLY = {
     | {f"{W}.calibration.problem", f"{W}.envs.gradient", f"{W}.envs.throw", f"{W}.envs.throws"},
     "gymnasium": {f"{W}.envs", f"{W}.envs.throw"},
     "stable_baselines3": set(),
-    "pxr": {f"{W}.io.usd"},
-    "h5py": {f"{W}.io.published"},
+    "pxr": {f"{W}.io.usd", f"{W}.io.usd_prims"},
+    "h5py": {f"{W}.io.published", f"{W}.io.recordings"},
     "dtx_to_wif": {f"{W}.io.draft"},
-    "pyvista": set(),
+    "viser": set(),
     "scenes": set(),
     "benchmarks": set(),
     "tests": set(),
     "common": set(),
 }
-"""Where a package may be imported at all; render.py asks for PyVista by name."""
+"""Where a package may be imported at all; view/ asks for viser by name."""
 
 BETWEEN_TERMS = {(f"{K}.terms.jamming", f"{K}.terms.stretch")}
 BETWEEN_TERMS |= {(f"{K}.terms.crimp_interchange", f"{K}.terms.{name}") for name in ("stretch", "bending")}
@@ -153,7 +154,7 @@ def test_importing_the_package_loads_no_extra():
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert {"warp", "warp_yarn", "numpy"} <= loaded
-    extras = {"pxr", "torch", "pyvista", "vtk", "vtkmodules", "imageio", "h5py", "scipy", "matplotlib", "newton"}
+    extras = {"pxr", "torch", "viser", "imageio", "h5py", "scipy", "matplotlib", "newton"}
     extras |= {"gymnasium", "stable_baselines3"}
     assert not loaded & extras
     assert "dtx_to_wif" not in loaded

@@ -1,5 +1,6 @@
 """Bad input: every refusal names the argument, its value and what is allowed."""
 
+import ctypes
 import pickle
 import subprocess
 import sys
@@ -209,7 +210,7 @@ def test_without_torch_there_is_no_attribute(monkeypatch) -> None:
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.delattr(wy, "torch", raising=False)
     assert not hasattr(wy, "torch") and getattr(wy, "torch", 3) == 3
-    with pytest.raises(wy.InputError, match=r"pip install warp_yarn\[torch\]"):
+    with pytest.raises(wy.InputError, match=r'pip install "\.\[torch\]".*pip install "torch"'):
         _ = wy.torch
 
 
@@ -230,6 +231,60 @@ def test_a_kernel_cache_that_cannot_be_written_is_named(tmp_path, when) -> None:
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.count("WARP_CACHE_PATH") == 2
+
+
+CLOTH_OF_MANY = wy.paper.cloth(rows=20, columns=20)
+
+
+@pytest.mark.parametrize(
+    ("call", "shown"),
+    [
+        (lambda big: wy.write_usd("a.usdc", big), "trajectory = an array of shape (400, 3), must be a Trajectory"),
+        (lambda big: wy.write_usd("a.usdc", wy.State(big, big, big, big)), "trajectory = an object of type State"),
+        (lambda big: wy.write_usd("a.usdc", [big]), "trajectory = an object of type list"),
+        (lambda big: wy.write_usd("a.usdc", "x" * 5000), "xxx…, must be a Trajectory"),
+        (lambda big: wy.Simulator(big), "scene = an array of shape (400, 3), must be a Scene"),
+        (lambda big: wy.Scene(CLOTH_OF_MANY, pins=big), "pins = an array of shape (400, 3), must be a list"),
+        (lambda big: wy.Scene(CLOTH_OF_MANY, pins=[0] * 4000), "pins names a node twice"),
+        (lambda big: wy.Yarn(density=big, stretch=1, bend=1), "density = an array of shape (400, 3), must be a number"),
+    ],
+)
+def test_messages_print_no_arrays(call, shown, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(wy.InputError) as error:
+        call(CLOTH_OF_MANY.position)
+    assert shown in str(error.value) and len(str(error.value)) < 300 and "\n" not in str(error.value)
+
+
+def test_more_steps_than_a_chunk_are_refused():
+    simulator = wy.Simulator(wy.paper.hung_cloth(rows=3, columns=3), chunk=2)
+    with pytest.raises(wy.InputError, match="steps = 3, must be a whole number, from 0 to 2"):
+        simulator.run_chunk(3)
+
+
+def test_warp_starts_without_a_banner():
+    """And where there is no CUDA driver, without a warning of that; what else comes is not lost."""
+    code = (
+        "import os, sys, warp_yarn as wy\n"
+        "from warp_yarn.device import start\n"
+        "start.device('cpu')\n"
+        "with start.without_line(b'unwanted', where=True):\n"
+        "    os.write(2, b'wanted\\nunwanted line\\nalso wanted\\n')\n"
+        "print('done')\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert ran.returncode == 0 and ran.stdout == "done\n"
+    told = ran.stderr.splitlines()
+    assert told[-2:] == ["wanted", "also wanted"]
+    assert not told[:-2] or ctypes_finds_cuda()
+
+
+def ctypes_finds_cuda() -> bool:
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def test_true_is_no_number():

@@ -20,6 +20,7 @@ from reference import Elements, bending, gravity, stretch, tensor
 
 import warp_yarn as wy
 import warp_yarn.torch as wt
+from warp_yarn.view.yarns import Weaving
 
 SAMPLES = 20000
 """Points along a yarn: its ends are found to a distance of 17 mm over that."""
@@ -534,5 +535,29 @@ def test_usd(name: str, shape: str, tmp_path: object) -> None:
     assert np.isfinite(points).all()
     if shape == "curves":
         counts = np.concatenate([np.array(each.GetCurveVertexCountsAttr().Get()) for each in found])
-        # both ends of a curve are there twice
-        assert sorted(counts.tolist()) == sorted(len(yarn) + 2 for yarn in yarns_of(name))
+        # both ends of a curve are there twice; where another yarn crosses the last node, a free end comes after it
+        yarns = yarns_of(name)
+        places = [place[:2] for yarn in yarns for place in yarn]
+        crossed = [sum(places.count(yarn[end][:2]) == 2 for end in (0, -1)) for yarn in yarns]
+        assert sorted(counts.tolist()) == sorted(
+            len(yarn) + 2 + more for yarn, more in zip(yarns, crossed, strict=True)
+        )
+
+
+def test_pictures_of_a_cut_cloth_show_the_weave_to_its_edge() -> None:
+    """Also where yarns that cross have no crossing in the model: over and under are those of the draft there."""
+    c = cut("disc")
+    weaving = Weaving(c)
+    edge = np.flatnonzero(weaving.crossed & (c.topology.is_crossing == 0))
+    assert len(edge) > 20
+    over = {}
+    for strands in weaving.strands:
+        starts = strands.counts.cumsum() - strands.counts
+        for begin, count, yarn in zip(starts, strands.counts, strands.yarn, strict=True):
+            for k in range(begin, begin + count):
+                over[int(strands.places[k]), int(c.topology.yarn_direction[yarn])] = strands.height[k]
+    row, column = c.topology.place[edge].T
+    warp_on_top = c.weave.draft[row, column]
+    assert 0 < warp_on_top.sum() < len(edge)
+    for node, top in zip(edge.tolist(), warp_on_top, strict=True):
+        assert (over[node, 0] > 0.0) == top and over[node, 0] * over[node, 1] < 0.0

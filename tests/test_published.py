@@ -231,7 +231,7 @@ def test_bytes_that_were_changed_are_an_input_error_or_do_no_harm(path, seed):
 
 def test_without_h5py_the_error_says_what_to_install(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(wy.InputError, match=r"pip install warp_yarn\[data\]"):
+    with pytest.raises(wy.InputError, match=r'pip install "\.\[data\]".*pip install "h5py'):
         wy.read_published(path)
 
 

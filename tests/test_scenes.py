@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from pxr import Usd, UsdGeom
 from scripts import ROOT, exit_code, load, samples
 
 import warp_yarn as wy
+from warp_yarn.io import usd as usd_files
 from warp_yarn.simulation.state import FIELDS
 
 hang = load("scenes/hang.py")
@@ -153,33 +155,152 @@ def test_a_recording_without_a_scene_is_not_resumed(usd, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_full_disk_ends_with_code_2_and_keeps_the_frames(usd, tmp_path, capsys, monkeypatch):
-    resource = pytest.importorskip("resource")
+def test_a_disk_that_fills_up_ends_with_code_2_and_keeps_the_frames(usd, tmp_path, small_disk, capsys, monkeypatch):
+    """Those until then are in the file, and where temporary files go for --resume; pictures are drawn."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    frames = []
+    a_step_at_a_time(monkeypatch)
+    monkeypatch.setattr(usd_files, "SAVE_BYTES", 1000)
+    run = wy.Simulator.run_chunk
 
-    def write(path, trajectory, **options):
-        """To a disk that is full, and then has room again."""
-        frames.append(trajectory)
-        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
-        try:
-            write_usd(path, trajectory, **options)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    def fill(simulator, steps):
+        if simulator.steps_done == 3:
+            (small_disk / "filler").write_bytes(bytes(shutil.disk_usage(small_disk).free))
+        return run(simulator, steps)
 
-    write_usd = wy.write_usd
-    monkeypatch.setattr(wy, "write_usd", write)
-    png = tmp_path / "hang.png"
-    arguments = ["--size", "3", "--steps", "4", "--output", str(usd), "--png", str(png)]
-    assert exit_code(hang, arguments) == 2
+    monkeypatch.setattr(wy.Simulator, "run_chunk", fill)
+    output, png = small_disk / "hang.usdc", tmp_path / "hang.png"
+    assert exit_code(hang, ["--size", "3", "--steps", "40", "--output", str(output), "--png", str(png)]) == 2
     told = capsys.readouterr().err
-    assert "hang.usdc cannot be written" in told and "File too large" in told
+    assert "No space left on device" in told and "hang.usdc" in told
     [kept] = (tmp_path / "temporary").rglob("*.npz")
-    assert str(kept) in told and wy.Trajectory.load(kept) == frames[0] and len(frames[0]) == 5
-    assert png.exists()  # what could be written was
-    assert [path.name for path in usd.parent.iterdir()] == []
+    frames = wy.Trajectory.load(kept)
+    assert str(kept) in told and 4 <= len(frames) < 41 and frames.scene is not None
+    # the frame that the disk had no room for is in one or the other
+    assert all(abs(count - len(frames)) <= 1 for count in samples(output))
+    assert sorted(path.name for path in small_disk.iterdir()) == ["filler", "hang.usdc"]
+    assert png.exists()
+    monkeypatch.setattr(wy.Simulator, "run_chunk", run)
+    both = hang.main(["--resume", str(kept), "--steps", str(40 - frames.steps_done), "--output", str(usd)])
+    assert both == hang.main(["--size", "3", "--steps", "40", "--output", str(usd)])
+
+
+@pytest.mark.parametrize("scene", ["hang", "drape", "fold", "pull", "stack"])
+def test_films_are_as_long_and_as_fast_as_asked_for(scene, tmp_path):
+    """24 frames of playing time a second, and twenty times slower: some fall between two steps."""
+    output, record = tmp_path / "a.usdc", tmp_path / "a.h5"
+    small = ["--size", "4"] if scene == "hang" else ["--rows", "4", "--columns", "4", "--friction", "0"]
+    options = [*small, "--seconds", "0.012", "--output", str(output), "--record", str(record)]
+    if scene == "fold":
+        options += ["--fold", "10"]
+    if scene == "pull":
+        options += ["--acceleration", "1"]
+    script = load(f"scenes/{scene}.py")
+    every = script.main(options)
+    steps = 12 + (10 if scene == "fold" else 0)
+    assert len(every) == steps + 1
+    film = script.main([*options, "--fps", "24"])
+    assert len(film) == int(steps * 1e-3 * 480) + 1 and film.step == pytest.approx(1 / 480)
+    places = 1e3 * film.time
+    for k, place in enumerate(places):
+        before, share = int(place + 1e-9), place - int(place + 1e-9)
+        after = min(before + 1, steps)
+        expected = every.position[before] + share * (every.position[after] - every.position[before])
+        np.testing.assert_allclose(film.position[k], expected, rtol=0, atol=1e-14)
+    stage = Usd.Stage.Open(str(output))
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(24.0) and stage.GetEndTimeCode() == len(film) - 1
+    assert wy.Trajectory.load(record) == film
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--steps", "3", "--seconds", "1"], "--steps 3 and --seconds 1, must be one of them"),
+        (["--seconds", "0"], "--seconds = 0.0, must be finite and above 0"),
+        (["--fps", "-1"], "--fps = -1.0, must be finite and above 0"),
+        (["--fps", "x"], "--fps = 'x', must be a number, finite and above 0"),
+        (["--fps", "60"], "--fps 60 at --slowdown 20, must be at most 50: a frame a step of 0.001 s"),
+        (["--slowdown", "0"], "--slowdown = 0.0, must be finite and above 0"),
+        (["--slowdown", "nan"], "--slowdown = nan, must be finite and above 0"),
+    ],
+)
+@pytest.mark.parametrize("scene", ["hang", "drape"])
+def test_lengths_and_rates_out_of_range_are_named(scene, arguments, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert exit_code(load(f"scenes/{scene}.py"), arguments) == 2
+    assert named in capsys.readouterr().err and not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize("scene", ["hang", "stack"])
+@pytest.mark.parametrize(
+    ("option", "package"), [("--png", "imageio.v2"), ("--mp4", "imageio.v2"), ("--mp4", "imageio_ffmpeg")]
+)
+def test_a_missing_extra_is_found_before_the_run(scene, option, package, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setattr(wy.Simulator, "run_chunk", None)
+    output = tmp_path / "a.usdc"
+    arguments = ["--rows", "4", "--columns", "4", "--output", str(output), option, str(tmp_path / f"a.{option[2:]}")]
+    assert exit_code(load(f"scenes/{scene}.py"), arguments) == 2
+    told = capsys.readouterr().err
+    assert f"{package.split('.')[0]} is not installed" in told and 'pip install ".[render]"' in told
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "packages", "extra"),
+    [
+        ("learn", ["torch", "matplotlib"], "torch"),
+        ("throw", ["torch", "matplotlib"], "torch"),
+        ("pullout", ["matplotlib"], "bench"),
+        ("throw", ["matplotlib"], "bench"),
+    ],
+)
+def test_help_needs_no_extras_and_a_run_says_which(scene, packages, extra, tmp_path):
+    code = (
+        "import sys, runpy\n"
+        f"for name in {packages}: sys.modules[name] = None\n"
+        "sys.path.insert(0, sys.argv[1].rpartition('/')[0])\n"
+        "sys.argv[:] = sys.argv[1:]\n"
+        "runpy.run_path(sys.argv[0], run_name='__main__')\n"
+    )
+    script = [sys.executable, "-c", code, str(ROOT / "scenes" / f"{scene}.py")]
+    ran = subprocess.run([*script, "--help"], capture_output=True, text=True, timeout=100)
+    assert ran.returncode == 0 and "usage:" in ran.stdout and not ran.stderr
+    given = ["a.npz"] if scene == "learn" else []
+    ran = subprocess.run([*script, *given], capture_output=True, text=True, timeout=100, cwd=tmp_path)
+    assert ran.returncode == 2 and f'pip install ".[{extra}]"' in ran.stderr and "Traceback" not in ran.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("README.md", "# A heading\n\nand text", r"README\.md: is no Python file that sets `scene`"),
+        ("scene.py", "scene = (", r"scene\.py: is no Python file"),
+        ("scene.bin", b"\xff\x00\x01", r"scene\.bin: is no Python file"),
+        ("scene.py", "a = 1", r"must set `scene` to a warp_yarn\.Scene"),
+        ("scene.py", "a = 1\nb = c", r"scene\.py, line 2: NameError: name 'c' is not defined"),
+        ("scene.py", "import sys\nsys.exit(0)", r"scene\.py, line 2: SystemExit: 0"),
+        (
+            "scene.py",
+            "import warp_yarn as wy\n\nwy.Yarn(density=0, stretch=1, bend=1)",
+            r"scene\.py, line 3: density = 0",
+        ),
+        ("scene.py", "float('x')", r"scene\.py, line 1: ValueError: could not convert"),
+        (
+            "scene.py",
+            "import warp_yarn as wy\nscene = wy.paper.hung_cloth(rows=3, columns=3)\nstate = scene.cloth.position",
+            r"sets `state` to an array of shape \(9, 3\), must be a warp_yarn\.State",
+        ),
+    ],
+)
+def test_files_that_set_no_scene(name, text, message, tmp_path):
+    terms = load("scenes/terms.py")
+    file = tmp_path / name
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(wy.InputError, match=message):
+        terms.main([str(file)])
 
 
 def test_an_output_folder_that_cannot_be_written_is_found_before_the_run(monkeypatch, capsys):

@@ -27,7 +27,7 @@ VERBS = set(
         end enter erase estimate evaluate exchange expand extend extrapolate factorize fail fetch fill find finish
         fit flatten follow forget free freeze gather get give go group guess halve hand hold identify ignore import
         initialize insert install integrate interpolate invert iterate join judge keep know launch learn leave let
-        limit linearize list load look lower lump make match measure merge minimize mirror mix move multiply name
+        limit linearize list load look lower lump make mark match measure merge minimize mirror mix move multiply name
         normalize note number open pack parse pass pay perform pick place plot prepare prescribe press print probe
         produce project propagate prove pull push put raise reach read ready rebuild recall receive record recover
         reduce refine refuse register release remember remove rename reorder repeat replace replay report request reset
@@ -118,3 +118,10 @@ def test_others_are_none(docstring):
 def test_docstrings_of_functions_begin_with_a_verb():
     found = {name: without_verb(file.read_text()) for name, file in FILES.items()}
     assert not {name: functions for name, functions in found.items() if functions}
+
+
+def test_slow_tests_are_there():
+    """Names that no test has any more would hide that they are quick."""
+    for name in (ROOT / "tests" / "slow.txt").read_text().splitlines():
+        file, *_, function = name.split("[")[0].split("::")
+        assert re.search(rf"^ *def {function}\(", (ROOT / file).read_text(), flags=re.M), name

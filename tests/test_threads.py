@@ -202,9 +202,7 @@ def test_threads_that_draw_at_once(tmp_path):
         "for thread in threads: thread.join()\n"
         "sys.exit(str(failed) if failed else 0)\n"
     )
-    pytest.importorskip("pyvista")
+    pytest.importorskip("imageio")
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
-    if "no OpenGL" in done.stderr:
-        pytest.skip("this machine cannot draw")
     assert done.returncode == 0, done.stderr
     assert len(list(tmp_path.glob("*.png"))) == 4

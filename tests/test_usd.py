@@ -1,18 +1,19 @@
 """USD files: what the validators of usd-core do not see, such as extents, counts, and which yarn is on top."""
 
 import dataclasses
+import itertools
 import os
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, UsdValidation
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 from scripts import load
-from waving import BLUE, RED, rotation, waving
+from waving import BLUE, RED, waving
 
 import warp_yarn as wy
 from warp_yarn.io import usd
-from warp_yarn.simulation.state import SHAPES
-from warp_yarn.view import geometry
+from warp_yarn.simulation.packing import SHAPES
+from warp_yarn.view import geometry, solids, yarns
 
 SINGLE = 8e-9
 """Rounding to single precision of the coordinates here, which are under 1/16 m, and of a sum of some of them [m]."""
@@ -30,8 +31,8 @@ def weave(request):
 
 
 def written(path, trajectory, **options):
-    """The file's stage, which has to be kept, and its yarns by name."""
-    wy.write_usd(path, trajectory, **options)
+    """The file's stage, which has to be kept, and its yarns by name; frames of 1 ms are at whole time codes."""
+    wy.write_usd(path, trajectory, **{"fps": 1000.0, **options})
     stage = Usd.Stage.Open(str(path))
     shapes = {prim.GetName(): prim for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)}
     schema = UsdGeom.Mesh if options.get("tubes") else UsdGeom.BasisCurves
@@ -43,6 +44,11 @@ def points_of(shape, frame):
 
 
 def curves_of(shape, frame):
+    """The curves of a prim, each without its free ends and repeated end points."""
+    return [curve[1:-1] for curve in with_ends(shape, frame)]
+
+
+def with_ends(shape, frame):
     """The curves of a prim, each without its repeated end points."""
     ends = np.cumsum(shape.GetCurveVertexCountsAttr().Get())
     return [curve[1:-1] for curve in np.split(points_of(shape, frame), ends[:-1])]
@@ -66,8 +72,8 @@ def test_warp_is_under_weft_where_the_draft_has_0_and_over_it_where_it_has_1(tmp
     trajectory.position[0] = trajectory.cloth.position
     warp, weft = woven(tmp_path / "a.usda", trajectory)
     rest = trajectory.cloth.position.reshape(6, 5, 3)
-    height = np.where(trajectory.cloth.weave.flipped, -RADIUS, RADIUS)
-    height[[0, -1]] = height[:, [0, -1]] = 0.0
+    height = np.where(trajectory.cloth.weave.draft, -RADIUS, RADIUS)
+    assert np.ptp(height[0]) and np.ptp(height[:, -1])
     offset = height[..., None] * [0.0, 0.0, 1.0]
     np.testing.assert_allclose(warp[0], rest - offset, rtol=0, atol=SINGLE)
     np.testing.assert_allclose(weft[0], rest + offset, rtol=0, atol=SINGLE)
@@ -90,7 +96,49 @@ def test_yarns_of_a_moving_cloth_cross_at_a_diameter_along_its_normal(tmp_path, 
         np.testing.assert_allclose(apart[frame, j, i], 2 * RADIUS * normal, rtol=0, atol=2 * SINGLE)
     border = np.ones((6, 5), dtype=bool)
     border[1:-1, 1:-1] = False
-    assert np.abs(apart[:, border]).max() < SINGLE
+    for frame, (j, i) in itertools.product(range(len(trajectory)), np.argwhere(border)):
+        # at right angles to the two yarns that meet there
+        along_warp = x[frame, j, min(i + 1, 4)] - x[frame, j, max(i - 1, 0)]
+        along_weft = x[frame, min(j + 1, 5), i] - x[frame, max(j - 1, 0), i]
+        normal = np.cross(along_warp, along_weft)
+        normal *= (-1.0 if trajectory.cloth.weave.draft[j, i] else 1.0) / np.linalg.norm(normal)
+        np.testing.assert_allclose(apart[frame, j, i], 2 * RADIUS * normal, rtol=0, atol=2 * SINGLE)
+
+
+def test_free_ends_stick_out_of_the_yarns_that_they_cross_last(tmp_path):
+    """By four tenths of a spacing, in the cloth's middle, straight on."""
+    trajectory = two_colored("plain")
+    _stage, shapes = written(tmp_path / "a.usda", trajectory)
+    x = trajectory.position.reshape(-1, 6, 5, 3)
+    for frame in range(len(trajectory)):
+        for curve, nodes in zip(with_ends(shapes["yarn_0"], frame), x[frame], strict=True):
+            for end, before, tip in ((nodes[0], nodes[1], curve[0]), (nodes[-1], nodes[-2], curve[-1])):
+                way = (end - before) / np.linalg.norm(end - before)
+                np.testing.assert_allclose(tip, end + (RADIUS + 4e-4) * way, rtol=0, atol=SINGLE)
+
+
+def test_selvedges_turn_from_each_weft_yarn_to_the_next(tmp_path):
+    trajectory = two_colored("twill")
+    _stage, shapes = written(tmp_path / "a.usda", trajectory)
+    _stage2, turned = written(tmp_path / "b.usda", trajectory, selvedge=True)
+    assert list(shapes["yarn_0"].GetCurveVertexCountsAttr().Get()) == [9] * 6
+    assert list(turned["yarn_0"].GetCurveVertexCountsAttr().Get()) == [9] * 6
+    # five yarns with their free ends, which are joined by a point each
+    assert list(turned["yarn_1"].GetCurveVertexCountsAttr().Get()) == [5 * 8 + 4 + 2]
+    for frame in range(len(trajectory)):
+        [one] = with_ends(turned["yarn_1"], frame)
+        for k, curve in enumerate(with_ends(shapes["yarn_1"], frame)):
+            np.testing.assert_array_equal(one[9 * k : 9 * k + 8], curve[::-1] if k % 2 else curve)
+        tops = one[8::9]
+        ends = np.array([(one[9 * k + 7], one[9 * k + 9]) for k in range(4)])
+        # half circles
+        distance = np.linalg.norm(ends - tops[:, None], axis=2)
+        apart = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+        np.testing.assert_allclose(distance, (0.5**0.5 * apart)[:, None].repeat(2, 1), rtol=0.15)
+    arc = UsdGeom.PrimvarsAPI(turned["yarn_1"]).GetPrimvar("arc").Get()
+    assert (np.diff(arc[1:-1]) > 0.0).all()
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert not UsdValidation.ValidationContext(validators).Validate(_stage2)
 
 
 def test_curves_are_catmull_rom_with_their_ends_repeated(tmp_path):
@@ -98,8 +146,8 @@ def test_curves_are_catmull_rom_with_their_ends_repeated(tmp_path):
     _stage, shapes = written(tmp_path / "a.usdc", trajectory)
     # Six warp and five weft yarns, alternating.
     assert {name: list(s.GetCurveVertexCountsAttr().Get()) for name, s in shapes.items()} == {
-        "yarn_0": [7] * 3 + [8] * 3,
-        "yarn_1": [7] * 3 + [8] * 2,
+        "yarn_0": [9] * 3 + [10] * 3,
+        "yarn_1": [9] * 3 + [10] * 2,
     }
     for shape in shapes.values():
         assert (shape.GetTypeAttr().Get(), shape.GetBasisAttr().Get()) == ("cubic", "catmullRom")
@@ -114,15 +162,77 @@ def test_curves_are_catmull_rom_with_their_ends_repeated(tmp_path):
                 assert (np.linalg.norm(np.diff(curve[1:-1], axis=0), axis=1) > RADIUS).all()
 
 
+def test_yarns_say_which_they_are_and_how_far_along(tmp_path, tubes):
+    """Also where they have slid, which is all that moves of u here."""
+    trajectory = waving()
+    trajectory.euler = trajectory.euler + np.array([0.0, 1e-4, 2e-4])[:, None, None] * [1.0, 0.0]
+    _stage, shapes = written(tmp_path / "a.usdc", trajectory, tubes=tubes)
+    warp, weft = [k for k in range(6)], [6 + k for k in range(5)]
+    for name, expected in (("yarn_0", warp[::2] + weft[::2]), ("yarn_1", warp[1::2] + weft[1::2])):
+        shape = shapes[name]
+        yarn, arc = (UsdGeom.PrimvarsAPI(shape).GetPrimvar(each) for each in ("yarn", "arc"))
+        assert (yarn.GetInterpolation(), arc.GetInterpolation()) == ("uniform", "vertex")
+        if tubes:
+            # the yarn of each face is that of what is connected with it
+            faces, connected = mesh_of(shape)
+            pairs = {(int(connected[face[0]]), k) for face, k in zip(faces, yarn.Get(), strict=True)}
+            assert len(pairs) == len(expected) and sorted(k for _, k in pairs) == sorted(expected)
+            assert len(arc.Get(1)) == len(points_of(shape, 1))
+            continue
+        assert list(yarn.Get()) == expected
+        ends = np.cumsum(shape.GetCurveVertexCountsAttr().Get())
+        for frame in range(3):
+            for k, along in zip(expected, np.split(np.array(arc.Get(frame)), ends[:-1]), strict=True):
+                nodes = 1e-3 * np.arange(5 if k < 6 else 6) + (1e-4 * frame if k < 6 else 0.0)
+                np.testing.assert_allclose(along[2:-2], nodes, rtol=0, atol=1e-9)
+                np.testing.assert_allclose(along[[1, -2]], nodes[[0, -1]] + [-7e-4, 7e-4], rtol=0, atol=1e-9)
+
+
+def test_velocities_are_those_of_points(tmp_path, tubes):
+    """Of a cloth that turns and moves as a rigid body, twice as slow as it is: ω × x + v, halved."""
+    trajectory = waving(frames=1)
+    spin, drift = np.array([3.0, -40.0, 15.0]), np.array([0.1, 0.0, -0.2])
+    trajectory.velocity = np.cross(spin, trajectory.position) + drift
+    _stage, shapes = written(tmp_path / "a.usdc", trajectory, tubes=tubes, slowdown=2.0, surface=True)
+    assert len(shapes) == 3
+    for shape in shapes.values():
+        expected = 0.5 * (np.cross(spin, points_of(shape, 0)) + drift)
+        # points in single precision, and a turn of 1e-4 R on their way
+        np.testing.assert_allclose(shape.GetVelocitiesAttr().Get(0), expected, rtol=0, atol=1e-6 * 4)
+    _stage2, without = written(tmp_path / "b.usdc", trajectory, tubes=tubes, velocities=False)
+    assert not any(shape.GetVelocitiesAttr().HasAuthoredValue() for shape in without.values())
+
+
+def test_a_cloth_at_rest_has_velocity_0(tmp_path, tubes):
+    _stage, shapes = written(tmp_path / "a.usdc", waving(frames=2), tubes=tubes)
+    for shape in shapes.values():
+        assert np.array_equal(shape.GetVelocitiesAttr().Get(1), 0.0 * points_of(shape, 1))
+
+
+def test_the_surface_is_the_cloths_middle_and_has_texture_coordinates(tmp_path):
+    trajectory = waving()
+    stage, _ = written(tmp_path / "a.usdc", trajectory, surface=True)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/cloth/surface"))
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get()).reshape(6, 5, 2)
+    np.testing.assert_allclose(st[..., 0], np.tile(np.linspace(0, 1, 5), (6, 1)), rtol=1e-6)
+    np.testing.assert_allclose(st[..., 1], np.tile(np.linspace(1, 0, 6)[:, None], (1, 5)), rtol=1e-6, atol=1e-7)
+    for frame in range(3):
+        np.testing.assert_allclose(points_of(mesh, frame), trajectory.position[frame], rtol=0, atol=SINGLE)
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    corners = trajectory.cloth.position[faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    assert area == pytest.approx(4e-3 * 5e-3, rel=1e-12)
+
+
 def test_each_material_has_its_own_yarns(tmp_path):
-    """Yarns on the border have no offset, so that their points are the nodes'."""
+    """Their points are a radius from the nodes'."""
     trajectory = waving(colors=(RED, BLUE, None), warp=[2, 0, 0, 0, 0, 0], weft=[0, 0, 0, 0, 2])
     _stage, shapes = written(tmp_path / "a.usdc", trajectory)
     assert sorted(shapes) == ["yarn_0", "yarn_2"]
     top, right = curves_of(shapes["yarn_2"], 2)
     x = trajectory.position[2].reshape(6, 5, 3)
-    np.testing.assert_allclose(top, x[0], rtol=0, atol=SINGLE)
-    np.testing.assert_allclose(right, x[:, -1], rtol=0, atol=SINGLE)
+    np.testing.assert_allclose(np.linalg.norm(top - x[0], axis=1), RADIUS, rtol=0, atol=SINGLE)
+    np.testing.assert_allclose(np.linalg.norm(right - x[:, -1], axis=1), RADIUS, rtol=0, atol=SINGLE)
 
 
 def test_extents_hold_the_yarns_with_their_radius(tmp_path, tubes):
@@ -155,27 +265,38 @@ def test_colours_are_linear_and_one_for_each_material(tmp_path, tubes):
         primvar = shape.GetDisplayColorPrimvar()
         assert primvar.GetInterpolation() == UsdGeom.Tokens.constant
         [colors[name]] = primvar.Get()
+        material, _ = UsdShade.MaterialBindingAPI(shape).ComputeBoundMaterial()
+        shader, _, _ = material.ComputeSurfaceSource()
+        assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
+        assert shader.GetInput("diffuseColor").Get() == colors[name]
     np.testing.assert_allclose(colors["yarn_0"], [0.21404114, 0.04 / 12.92, 1.0], rtol=1e-6)
     # Coral by default: more red than green, more green than blue.
     assert np.diff(colors["yarn_1"]).max() < -0.05
 
 
-@pytest.mark.parametrize("slowdown", [1.0, 20.0])
-def test_stage_metadata(tmp_path, tubes, slowdown):
-    stage, _ = written(tmp_path / "a.usda", waving(frames=4), tubes=tubes, slowdown=slowdown)
+@pytest.mark.parametrize("slowdown, fps, apart", [(1.0, 24.0, 0.024), (20.0, 24.0, 0.48), (100.0, 30.0, 3.0)])
+def test_frames_are_where_they_are_when_played(tmp_path, tubes, slowdown, fps, apart):
+    """And the file says how much slower that is."""
+    options = {} if fps == 24.0 else {"fps": fps}
+    wy.write_usd(tmp_path / "a.usda", waving(frames=4), tubes=tubes, slowdown=slowdown, **options)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 3.0)
-    assert stage.GetTimeCodesPerSecond() == pytest.approx(1000.0 / slowdown, rel=1e-12)
-    assert stage.GetFramesPerSecond() == pytest.approx(1000.0 / slowdown, rel=1e-12)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, pytest.approx(3.0 * apart, rel=1e-9))
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == fps
     assert stage.GetDefaultPrim().GetPath() == "/cloth"
+    layer = stage.GetRootLayer()
+    assert dict(layer.customLayerData) == {"slowdown": slowdown, "step": 1e-3}
+    assert f"takes {slowdown:g} s to play" in layer.comment
+    samples = UsdGeom.PointBased(stage.GetPrimAtPath("/cloth/yarn_0")).GetPointsAttr().GetTimeSamples()
+    assert samples == pytest.approx([0.0, apart, 2 * apart, 3 * apart], rel=1e-9)
 
 
 def test_points_move_and_nothing_else_does(tmp_path, tubes):
     _stage, shapes = written(tmp_path / "a.usdc", waving(), tubes=tubes)
     for shape in shapes.values():
         moving = {a.GetName() for a in shape.GetPrim().GetAuthoredAttributes() if a.GetNumTimeSamples()}
-        assert moving == {"points", "extent"}
+        assert moving == {"points", "extent", "velocities", "primvars:arc"}
         assert shape.GetPointsAttr().GetTimeSamples() == [0.0, 1.0, 2.0]
         assert np.abs(points_of(shape, 2) - points_of(shape, 0)).max() > RADIUS
         # With normals, curves are ribbons.
@@ -276,7 +397,7 @@ def test_an_obstacle_is_drawn_where_cloth_touches_it(tmp_path, shape, moving):
     for steps in (1, 2, 3):
         simulator = wy.Simulator(scene, integrator="implicit-euler")
         trajectory = simulator.run(steps)
-        wy.write_usd(tmp_path / "a.usdc", trajectory)
+        wy.write_usd(tmp_path / "a.usdc", trajectory, fps=1000.0)
         stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
         prim = stage.GetPrimAtPath(f"/obstacles/{shape}_0")
         touching = simulator.contacts()
@@ -312,8 +433,17 @@ def test_usd_validates_obstacles(tmp_path):
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [(error.GetName(), error.GetMessage()) for error in errors] == []
     assert stage.GetDefaultPrim().GetPath() == "/cloth"
-    assert len(stage.GetPrimAtPath("/obstacles").GetChildren()) == 6
+    drawn = [prim for prim in stage.GetPrimAtPath("/obstacles").GetChildren() if prim.IsA(UsdGeom.Gprim)]
+    assert len(drawn) == 6
+    assert all(UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0] for prim in drawn)
     assert not written(tmp_path / "b.usdc", waving())[0].GetPrimAtPath("/obstacles")
+
+
+def triangles(tubes, sides):
+    """The faces of tubes as triangles."""
+    corners, vertices = tubes.faces(sides)
+    faces = np.split(vertices, corners.cumsum()[:-1])
+    return np.array([(face[0], face[k], face[k + 1]) for face in faces for k in range(1, len(face) - 1)])
 
 
 # -- tubes -----------------------------------------------------------------------------------------------------------
@@ -361,14 +491,15 @@ def test_tubes_are_at_the_radius_from_their_curves_and_face_outward(thin, frame)
     for curve, mesh in thin:
         faces, yarn = mesh_of(mesh)
         points = points_of(mesh, frame)
-        yarns = curves_of(curve, frame)
+        yarns = with_ends(curve, frame)
         assert yarn.max() + 1 == len(yarns)
         for k, nodes in enumerate(yarns):
             centres = catmull_rom(nodes, 400)
             mine = points[yarn == k]
             distance = np.linalg.norm(mine[:, None] - centres, axis=2)
-            # Samples of the curve are up to 4 µm apart, which adds (2 µm)²/2R.
-            np.testing.assert_allclose(distance.min(axis=1), 1e-4, rtol=0, atol=2e-8 + SINGLE)
+            # the curve's points are not between the cloth's middle and its normals as those of tubes are: by about R
+            # times the square of the angle of normals from node to node, up to 0.4 here
+            np.testing.assert_allclose(distance.min(axis=1), 1e-4, rtol=0, atol=2e-5)
             volume = 0.0
             for face in (f for f in faces if yarn[f[0]] == k):
                 corner = points[face]
@@ -397,37 +528,57 @@ def test_tubes_are_closed(thin):
         )[0]
 
 
-def test_rings_do_not_twist():
-    """From ring to ring, and at a yarn's first ring from frame to frame, no vector turns by more than the yarn does."""
-    trajectory = waving(frames=20)
-    for part in geometry.strands(trajectory):
-        tubes = geometry.Tubes.around(part, sides=8, samples=4)
-        _, _, tangents = part.sampled(4)
-        across = tubes.across
-        first = tubes.counts.cumsum() - tubes.counts
-        inside = np.setdiff1d(np.arange(tubes.counts.sum()), first)
-        turned = (tangents[:, inside] * tangents[:, inside - 1]).sum(axis=-1)
-        moved = (tangents[1:, first] * tangents[:-1, first]).sum(axis=-1)
-        for k in range(2):
-            assert ((across[:, inside, k] * across[:, inside - 1, k]).sum(axis=-1) >= turned - 1e-12).all()
-            assert ((across[1:, first, k] * across[:-1, first, k]).sum(axis=-1) >= moved - 1e-12).all()
-        frames = np.concatenate([across, tangents[:, :, None]], axis=2)
-        np.testing.assert_allclose(frames @ frames.swapaxes(2, 3), np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
-        np.testing.assert_allclose(np.linalg.det(frames), 1.0, rtol=0, atol=1e-12)
+def test_sections_are_across_the_yarn_and_as_wide_along_the_cloth_as_it_is():
+    """Whatever the weave, rings are at right angles to their yarn, and their width to the cloth's normal too."""
+    trajectory = waving("satin", radius=1e-4)
+    weaving = yarns.Weaving(trajectory.cloth)
+    for frame, strands in itertools.product(range(3), weaving.strands):
+        look = weaving.look(trajectory.position[frame])
+        tubes = yarns.Tubes.around(strands, samples=40)
+        centre, across = tubes.rings(*look)
+        frames = np.concatenate([across, np.cross(across[:, :1], across[:, 1:])], axis=1)
+        np.testing.assert_allclose(frames @ frames.swapaxes(1, 2), np.tile(np.eye(3), (len(frames), 1, 1)), atol=1e-12)
+        inside = np.delete(np.arange(len(centre) - 1), tubes.counts.cumsum()[:-1] - 1)
+        ahead = yarns.unit(centre[inside + 1] - centre[inside])
+        # chords of a 40th of a segment, in which a yarn turns by up to 0.05, and normals that are not held for fixed
+        assert (ahead * frames[inside, 2]).sum(axis=1).min() > 0.99
+        at_nodes = tubes.share == 0.0
+        normal = look[1][tubes.places[at_nodes, 1]]
+        np.testing.assert_allclose((across[at_nodes, 0] * normal).sum(axis=1), 0.0, atol=1e-12)
 
 
-def test_rings_of_a_yarn_in_a_plane_keep_their_angle_to_it():
-    """The yarns of a flat cloth; vectors that were only projected from ring to ring would turn."""
-    trajectory = two_colored("plain", frames=1)
-    turn = rotation(np.array([0.5, -0.7, 0.9]))
-    trajectory.position[0] = trajectory.cloth.position @ turn.T
-    warp, weft = geometry.strands(trajectory)
-    for part, normal in ((warp, turn[:, 1]), (weft, turn[:, 0])):
-        tubes = geometry.Tubes.around(part, sides=8, samples=4)
-        for across in np.split(tubes.across[0], tubes.counts.cumsum()[:-1]):
-            cosines = across @ normal
-            assert 0.05 < np.abs(cosines[0, 0]) < 0.999
-            np.testing.assert_allclose(cosines, np.broadcast_to(cosines[0], cosines.shape), rtol=0, atol=1e-12)
+def winding(points, vertices, faces):
+    """How often closed surfaces go around points: the solid angles of their triangles over 4 π."""
+    a, b, c = (vertices[faces[:, k]] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(each, axis=2) for each in (a, b, c))
+    below = la * lb * lc + (a * b).sum(2) * lc + (b * c).sum(2) * la + (c * a).sum(2) * lb
+    return np.arctan2((a * np.cross(b, c)).sum(2), below).sum(1) / (2.0 * np.pi)
+
+
+def test_the_winding_number_tells_inside_from_outside():
+    cube = wy.Box(center=(0, 0, 0), half_extents=(1, 1, 1))
+    vertices, _, faces = solids.solid(geometry.Placed(cube, np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]]), 0.0, 0.0))
+    found = winding(np.array([[0.9, 0.9, -0.9], [0.0, 0.0, 0.0], [1.1, 0.0, 0.0], [3.0, 2.0, 1.0]]), vertices, faces)
+    np.testing.assert_allclose(found, [1, 1, 0, 0], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius, off", [(2e-4, 0.1), (2.8e-4, 0.1), (4e-4, 0.1), (5e-4, 0.25)])
+def test_tubes_do_not_run_through_each_other(weave, radius, off):
+    """On a flat cloth, of any cover: a yarn with a little of its section taken off is outside of the others. A tenth is
+    for facets, and for yarns that are not straight over the width of what crosses them; at the fullest cover, where
+    neighbours touch all along, there is no room between them for those that pass."""
+    trajectory = two_colored(weave, frames=1, radius=radius)
+    weaving = yarns.Weaving(trajectory.cloth)
+    look = weaving.look(trajectory.cloth.position)
+    tubes = [yarns.Tubes.around(strands, samples=6) for strands in weaving.strands]
+    for one, others in (tubes, tubes[::-1]):
+        centre, _ = one.rings(*look)
+        second = slice(one.counts[0], one.counts[:2].sum())
+        vertices = one.vertices(*look, 12).reshape(-1, 12, 3)[second]
+        smaller = centre[second, None] + (1.0 - off) * (vertices - centre[second, None])
+        around = winding(smaller.reshape(-1, 3), others.vertices(*look, 12), triangles(others, 12))
+        assert np.abs(around).max() < 0.5
 
 
 def test_a_yarn_shrunk_to_a_point_or_folded_stays_finite(tmp_path, tubes):
@@ -453,7 +604,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, tubes, 
     path = tmp_path / "a.usdc"
     if existing is not None:
         path.write_bytes(existing)
-    monkeypatch.setattr(usd, "_write_points", fails)
+    monkeypatch.setattr(usd, "write_points", fails)
     with pytest.raises(OSError, match="no space left"):
         wy.write_usd(path, waving(), tubes=tubes)
     assert os.listdir(tmp_path) == ([] if existing is None else ["a.usdc"])
@@ -491,7 +642,7 @@ def test_no_stage_holds_the_file_when_it_is_moved(tmp_path, monkeypatch):
 
 def test_a_file_is_replaced(tmp_path):
     wy.write_usd(tmp_path / "a.usdc", waving(frames=2))
-    wy.write_usd(str(tmp_path / "a.usdc"), waving(frames=3))
+    wy.write_usd(str(tmp_path / "a.usdc"), waving(frames=3), fps=1000)
     assert Usd.Stage.Open(str(tmp_path / "a.usdc")).GetEndTimeCode() == 2.0
     assert os.listdir(tmp_path) == ["a.usdc"]
 
@@ -499,11 +650,13 @@ def test_a_file_is_replaced(tmp_path):
 @pytest.mark.parametrize(
     "name, options, message",
     [
-        ("a.obj", {}, "must end in .usd, .usda, .usdc"),
-        ("a", {}, "must end in .usd, .usda, .usdc"),
+        ("a.obj", {}, "must end in .usd, .usda, .usdc, .usdz"),
+        ("a", {}, "must end in .usd, .usda, .usdc, .usdz"),
         ("missing/a.usdc", {}, "does not exist"),
         ("a.usdc", {"slowdown": 0.0}, "slowdown = 0.0, must be finite and above 0"),
         ("a.usdc", {"slowdown": np.inf}, "slowdown"),
+        ("a.usdc", {"fps": 0.0}, "fps = 0.0, must be finite and above 0"),
+        ("a.usdc", {"fps": np.nan}, "fps"),
         ("a.usdc", {"sides": 2}, "sides = 2, must be a whole number, at least 3"),
     ],
 )
@@ -579,7 +732,7 @@ def test_a_rewritten_file_is_read_anew(tmp_path, monkeypatch, ending):
     for k, (first, again) in enumerate([("a", "a"), ("a", "link"), ("link", "a"), (str(tmp_path / "a"), "a")]):
         wy.write_usd(f"{first}{ending}", waving(frames=2 + k))
         stage = Usd.Stage.Open(f"{first}{ending}")
-        wy.write_usd(f"{again}{ending}", waving(frames=9 + k))
+        wy.write_usd(f"{again}{ending}", waving(frames=9 + k), fps=1000)
         assert Usd.Stage.Open(f"{first}{ending}").GetEndTimeCode() == 8.0 + k
         assert stage.GetEndTimeCode() == 8.0 + k
         assert os.path.islink(f"link{ending}")

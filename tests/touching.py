@@ -58,6 +58,15 @@ def far_apart(cloth: wy.Cloth, simulator: wy.Simulator) -> np.ndarray:
     return rest >= 0.5 * np.pi * touch
 
 
+def middles(rows: int, columns: int) -> np.ndarray:
+    """What samples are of nodes, middles of all segments too [samples, nodes]: by rows and columns."""
+    node = np.arange(rows * columns).reshape(rows, columns)
+    ends = [(node[:, :-1], node[:, 1:]), (node[:-1], node[1:])]
+    first, second = (np.concatenate([pair[k].ravel() for pair in ends]) for k in (0, 1))
+    each = np.eye(rows * columns)
+    return np.concatenate([each, 0.5 * (each[first] + each[second])])
+
+
 def gaps_of_pairs(cloth: wy.Cloth, simulator: wy.Simulator, position: np.ndarray) -> np.ndarray:
     """Distances of all pairs that may touch, each once [pairs]."""
     distance = np.linalg.norm(position[:, None] - position[None], axis=2)

@@ -4,7 +4,7 @@ import importlib
 import importlib.metadata
 from types import ModuleType
 
-from . import moved
+from . import moved, view
 from .description import outline
 from .description.cloth import Cloth
 from .description.cloths import Cloths
@@ -16,7 +16,15 @@ from .description.pieces import piece
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
-from .errors import GradientError, InputError, NoAttributeError, SimulationError, WarpYarnError
+from .errors import (
+    GradientError,
+    InputError,
+    NoAttributeError,
+    SimulationError,
+    WarpYarnError,
+    WarpYarnWarning,
+    missing_extra,
+)
 from .integrators.stage import StageMethod
 from .integrators.tableau import sdirk
 from .io.draft import read_draft, write_draft
@@ -27,8 +35,9 @@ from .presets import fabrics, paper
 from .registration import register_integrator, register_term, unregister_integrator, unregister_term
 from .simulation.simulator import Simulator
 from .simulation.state import State, Trajectory
+from .view.camera import Camera
 from .view.drawdown import write_drawdown
-from .view.render import write_mp4, write_png
+from .view.render import steady_camera, write_mp4, write_png
 
 moved.install()
 
@@ -38,6 +47,7 @@ __all__ = [
     "FIBRES",
     "WEAVES",
     "Box",
+    "Camera",
     "Capsule",
     "Cloth",
     "Cloths",
@@ -61,6 +71,7 @@ __all__ = [
     "TriangleMesh",
     "Variant",
     "WarpYarnError",
+    "WarpYarnWarning",
     "Weave",
     "Wind",
     "Yarn",
@@ -75,8 +86,10 @@ __all__ = [
     "register_integrator",
     "register_term",
     "sdirk",
+    "steady_camera",
     "unregister_integrator",
     "unregister_term",
+    "view",
     "write_draft",
     "write_drawdown",
     "write_mp4",
@@ -95,4 +108,4 @@ def __getattr__(name: str) -> ModuleType:
         if error.name != "torch":
             raise
         # what hasattr and getattr with a default take for an answer
-        raise NoAttributeError("gradients need torch: pip install warp_yarn[torch]") from error
+        raise NoAttributeError(str(missing_extra("torch", "gradients need", "torch"))) from error

@@ -1,12 +1,17 @@
 """What can go wrong, as exceptions that say where, with which value, and what is allowed."""
 
 import functools
+import importlib.metadata
+import re
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from .moved import renamed
+
+LONGEST = 200
+"""Characters of a value in a message."""
 
 
 class WarpYarnError(Exception):
@@ -41,6 +46,10 @@ class SimulationError(WarpYarnError, RuntimeError):
         return functools.partial(type(self), **numbers), self.args, self.__dict__
 
 
+class WarpYarnWarning(UserWarning):
+    """What can be used and is likely not meant: a number in another unit, or a reading that pins turn."""
+
+
 class GradientError(WarpYarnError, RuntimeError):
     """A gradient that could not be computed.
 
@@ -65,7 +74,7 @@ def finite_array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.nda
             raise TypeError(f"of type {given.dtype}")
         array = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be an array of numbers, got {value!r}") from error
+        raise InputError(f"{name} must be an array of numbers, got {brief(value)}") from error
     wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         raise InputError(f"{name} has shape {array.shape}, must be {wanted}")
@@ -87,9 +96,9 @@ def real(name: str, value: Any, *, above: float | None = None, least: float | No
             raise TypeError("text, or true or false")
         result = float(value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{name} = {value!r}, must be a number, {allowed}") from error
+        raise InputError(f"{name} = {brief(value)}, must be a number, {allowed}") from error
     if not np.isfinite(result) or (above is not None and result <= above) or (least is not None and result < least):
-        raise InputError(f"{name} = {value!r}, must be {allowed}")
+        raise InputError(f"{name} = {brief(value)}, must be {allowed}")
     return result
 
 
@@ -98,7 +107,7 @@ def integer(name: str, value: Any, *, least: int, most: int | None = None) -> in
     wrong = isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least
     if wrong or (most is not None and value > most):
         allowed = f"at least {least}" if most is None else f"from {least} to {most}"
-        raise InputError(f"{name} = {value!r}, must be a whole number, {allowed}")
+        raise InputError(f"{name} = {brief(value)}, must be a whole number, {allowed}")
     return int(value)
 
 
@@ -106,7 +115,7 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
     """Gives value, or an InputError where it is none of the allowed names."""
     names = list(allowed)
     if value not in names:
-        raise InputError(f"{name} = {value!r}, must be one of {', '.join(names)}")
+        raise InputError(f"{name} = {brief(value)}, must be one of {', '.join(names)}")
     return value
 
 
@@ -119,13 +128,38 @@ def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:
     if array.size == 0:
         return np.zeros(0, dtype=np.int32)
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
-        raise InputError(f"{name} = {value!r}, must be a list of whole numbers, the {what}")
+        raise InputError(f"{name} = {brief(value)}, must be a list of whole numbers, the {what}")
     outside = array[(array < 0) | (array >= count)]
     if outside.size:
         raise InputError(f"{name} names {what} {int(outside[0])}, must be from 0 to {count - 1}")
     if len(np.unique(array)) != len(array):
-        raise InputError(f"{name} names a {what} twice: {array.tolist()}")
+        raise InputError(f"{name} names a {what} twice: {brief(array.tolist())}")
     return array.astype(np.int32)
+
+
+def brief(value: Any) -> str:
+    """Shows a value in a few words: of arrays, and what prints as much, the kind and the shape."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    text = repr(value)
+    if "\n" in text or "array(" in text:
+        return f"an object of type {type(value).__name__}"
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+
+
+def missing_extra(package: str, needed_by: str, extra: str) -> InputError:
+    """Makes the error that says which extra is not installed, and how to install it: an index need not have
+    warp_yarn, but it has what the extra is made of."""
+    try:
+        wanted = importlib.metadata.requires("warp_yarn") or []
+    except importlib.metadata.PackageNotFoundError:
+        wanted = []
+    packages = [each.split(";")[0].strip() for each in wanted if re.search(rf"extra == ['\"]{extra}['\"]", each)]
+    anywhere = " ".join(f'"{each}"' for each in packages) or package
+    return InputError(
+        f'{package} is not installed, which {needed_by}: pip install ".[{extra}]" in the clone of warp_yarn, or '
+        f"pip install {anywhere}"
+    )
 
 
 __getattr__ = renamed(__name__, {"number": "real", "whole": "integer"})

@@ -31,7 +31,8 @@ OTHER_INPUTS = ("sliding", "state", "steps_done", "forces", "pin_path")
 """What calls and ablations say beside the names of terms, parameters and arrays."""
 OF_FRICTION = {"anchor", "friction_force_out"}
 """What there is with friction alone."""
-OF_STEPS = {"pin_target_path", "pin_start", "pin_motion", "applied_force_path"}
+OF_STEPS = {"pin_target_path", "pin_start", "pin_motion", "applied_force_path", "gravity_path", "wind_velocity_path"}
+OF_STEPS |= {"gust"}
 """What becomes an input of a step."""
 OF_THE_SYSTEM = {"rhs", "euler_rhs", "solution", "euler_solution"}
 """What is made of what all terms write."""

@@ -22,7 +22,7 @@ from ..core.variant import Variant
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
-    scalar, vec3, sym33 = variant.scalar, variant.vec3, variant.sym33
+    scalar, vec3 = variant.scalar, variant.vec3
     Pairs = structs(variant).Pairs
     module = variant.module("broad_phase")
 
@@ -61,15 +61,13 @@ def define(variant: Variant) -> SimpleNamespace:
         outdated: wp.array(dtype=int),
         status: wp.array(dtype=int),
     ):
-        """Make the list of a node, and no blocks: those of the list before are of other nodes."""
+        """Make the list of a node."""
         i = index(wp.tid())
         x = position[i]
         near_position[i] = x
         outdated[0] = 0
         u = rest_place[2 * i]
         v = rest_place[2 * i + 1]
-        for k in range(i * pairs.near_room, (i + 1) * pairs.near_room):
-            pairs.near_block[k] = sym33()
         count = int(0)
         touch = self_contact_distance[0] + self_contact_range[0]
         reach = touch + near_margin[0]

@@ -31,13 +31,12 @@ PLACES = 24
 
 
 @functools.cache
-def define(variant: Variant) -> SimpleNamespace:
+def functions(variant: Variant) -> SimpleNamespace:
+    """Make what finds the way that is clear."""
     scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
-    to_obstacle, obstacle_speed = obstacles.functions(variant).to_obstacle, obstacles.functions(variant).obstacle_speed
-    note_motion = barrier.functions(variant).note_motion
-    Obstacles, Faces, Pairs = structs(variant).Obstacles, structs(variant).Faces, structs(variant).Pairs
+    to_obstacle = obstacles.functions(variant).to_obstacle
+    Obstacles, Faces = structs(variant).Obstacles, structs(variant).Faces
     vec4, to_face = variant.vec4, mesh_contact.functions(variant).to_face
-    module = variant.module("contact_limits")
 
     @wp.func
     def nearest(obstacles: Obstacles, faces: Faces, meshes: wp.array(dtype=wp.uint64), k: int, x: vec3) -> vec4:
@@ -88,6 +87,18 @@ def define(variant: Variant) -> SimpleNamespace:
         """Find where a place is that goes with an obstacle, from where it was before."""
         local = wp.quat_rotate_inv(obstacle_rotation_before[k], x - obstacle_position_before[k])
         return obstacles.obstacle_position[k] + wp.quat_rotate(obstacles.obstacle_rotation[k], local)
+
+    return SimpleNamespace(nearest=nearest, reach=reach, taken=taken)
+
+
+@functools.cache
+def define(variant: Variant) -> SimpleNamespace:
+    scalar, vec3, quat = variant.scalar, variant.vec3, variant.quat
+    obstacle_speed = obstacles.functions(variant).obstacle_speed
+    nearest, reach, taken = functions(variant).nearest, functions(variant).reach, functions(variant).taken
+    note_motion = barrier.functions(variant).note_motion
+    Obstacles, Faces, Pairs = structs(variant).Obstacles, structs(variant).Faces, structs(variant).Pairs
+    module = variant.module("contact_limits")
 
     @wp.kernel(module=module, enable_backward=False)
     def limit_to_obstacles(

@@ -220,7 +220,7 @@ def define_search(variant: Variant) -> SimpleNamespace:
 
 TERM = Term(
     name="meshes",
-    elements="nodes",
+    elements="samples",
     define=define,
     energy=define_energy,
     absent=lambda scene: (

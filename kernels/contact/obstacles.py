@@ -189,7 +189,7 @@ def define_reports(variant: Variant) -> SimpleNamespace:
 
 TERM = Term(
     name="obstacles",
-    elements="node_obstacles",
+    elements="sample_obstacles",
     define=define,
     energy=define_energy,
     parameters=(

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..core.indexing import index
-from ..core.status import OVERLAPPING, fail
+from ..core.status import CROWDED, OVERLAPPING, fail
 from ..core.structs import structs
 from ..core.variant import Term, TermParameter, Variant
 from ..linear.pair_blocks import PAIRS_TOUCH
@@ -48,9 +48,10 @@ def define(variant: Variant) -> wp.Kernel:
         velocity: wp.array(dtype=vec3),
         increment: wp.array(dtype=vec3),
         step_size: wp.array(dtype=scalar),
-        # forces out, and whether anything touches
+        # forces out, whether anything touches, and more than there is room for
         force: wp.array(dtype=vec3),
         touching: wp.array(dtype=int),
+        status: wp.array(dtype=int),
         # matrix out
         matrix: int,
         blocks: BlockMatrix,
@@ -61,12 +62,12 @@ def define(variant: Variant) -> wp.Kernel:
             self_contact_damping_speed,
         )  # fmt: skip
         first = p * pairs.near_room
+        if matrix != 0:
+            pairs.touch_count[p] = 0
         for k in range(first, first + pairs.near_count[p]):
             q = index(pairs.near[k])
             r = position[p] - position[q]
             gap = wp.length(r)
-            if matrix != 0:
-                pairs.near_block[k] = sym33()
             if gap < law[DISTANCE] + law[RANGE]:
                 n = r / gap
                 v = velocity[p] - velocity[q]
@@ -78,7 +79,14 @@ def define(variant: Variant) -> wp.Kernel:
                         law, contact_friction[0], gap, n, v, blocks.coefficients[0], blocks.evaluations[0]
                     )
                     wp.atomic_add(blocks.diagonal_xx, p, b)
-                    pairs.near_block[k] = sym33(b[0, 0], b[0, 1], b[0, 2], b[1, 1], b[1, 2], b[2, 2])
+                    slot = pairs.touch_count[p]
+                    if slot < pairs.touch_room:
+                        place = index(p * pairs.touch_room + slot)
+                        pairs.touch[place] = q
+                        pairs.touch_block[place] = sym33(b[0, 0], b[0, 1], b[0, 2], b[1, 1], b[1, 2], b[2, 2])
+                        pairs.touch_count[p] = slot + 1
+                    else:
+                        fail(status, wp.static(CROWDED), p)
 
     return self_contact_term
 
@@ -262,7 +270,7 @@ def define_limits(variant: Variant) -> SimpleNamespace:
 
 TERM = Term(
     name="self_contact",
-    elements="nodes",
+    elements="samples",
     define=define,
     energy=define_energy,
     parameters=(

@@ -138,14 +138,21 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class Pairs:
-        """Nodes that are near each other: of each node ``near_room`` places, of which ``near_count`` are taken, and the
-        matrix block of those that touch it, which is 0 for the others."""
+        """Samples that are near each other (nodes, or middles of segments too, which are behind them): of each
+        ``near_room`` places, of which ``near_count`` are taken. Of those that touched it when the matrix was filled, as
+        many as ``touch_count`` in ``touch_room`` places, and their blocks. Where middles touch, the segments at each
+        node, else nothing."""
 
         near_room: int
         near_count: wp.array(dtype=int)
         near: wp.array(dtype=int)
-        near_block: wp.array(dtype=sym33)
+        touch_room: int
+        touch_count: wp.array(dtype=int)
+        touch: wp.array(dtype=int)
+        touch_block: wp.array(dtype=sym33)
         touching: wp.array(dtype=int)
+        segments: wp.array(dtype=wp.vec4i)
+        node_segments: wp.array(dtype=int)
 
     @wp.struct
     class Obstacles:
@@ -162,7 +169,7 @@ def structs(variant: Variant) -> SimpleNamespace:
 
     @wp.struct
     class Faces:
-        """Of each face of all meshes three corners and its obstacle; of each node ``face_room`` places, of which
+        """Of each face of all meshes three corners and its obstacle; of each sample ``face_room`` places, of which
         ``face_count`` are taken by faces that are near."""
 
         face_room: int

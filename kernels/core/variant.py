@@ -6,8 +6,10 @@ from typing import Any
 
 import warp as wp
 
-ELEMENTS = ("nodes", "crossings", "segments", "bends", "triangles", "seams", "pins", "applied", "node_obstacles")
-"""What a term's kernel may run over."""
+ELEMENTS = (
+    "nodes", "crossings", "segments", "bends", "triangles", "seams", "pins", "applied", "samples", "sample_obstacles"
+)  # fmt: skip
+"""What a term's kernel may run over. Samples are what touches: nodes, or points between them too."""
 
 
 @dataclasses.dataclass(frozen=True)

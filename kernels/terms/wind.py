@@ -4,7 +4,8 @@
 
 a third of it on each vertex.
 
-Parameters: ``wind_velocity`` [m/s]; ``wind_density`` ρ_w [kg/m³]; ``wind_drag`` c_d [kg/(m² s)].
+Parameters: ``wind_velocity`` [m/s]; ``wind_density`` ρ_w [kg/m³]; ``wind_drag`` c_d [kg/(m² s)]. Where there are gusts,
+the mean of the nodes' ``gust`` comes to the wind's velocity.
 
 The matrix holds the exact derivative by velocity, which is symmetric positive semi-definite:
 −∂F/∂v = A (2 ρ_w |v_n| n nᵀ + c_d (I − n nᵀ)). The derivative by position is not symmetric, and left out.
@@ -18,10 +19,19 @@ from ..core.variant import Term, TermParameter, Variant
 
 
 def define(variant: Variant) -> wp.Kernel:
+    return _define(variant, gusty=False)
+
+
+def define_gusty(variant: Variant) -> wp.Kernel:
+    """Define the kernel of wind with gusts, in a module of its own: who has none does not compile it."""
+    return _define(variant, gusty=True)
+
+
+def _define(variant: Variant, *, gusty: bool) -> wp.Kernel:
     scalar, vec3 = variant.scalar, variant.vec3
     BlockMatrix = structs(variant).BlockMatrix
 
-    @variant.kernel("terms")
+    @variant.kernel("gusts" if gusty else "terms")
     def wind_term(
         # topology
         triangle_nodes: wp.array(dtype=wp.vec3i),
@@ -30,6 +40,7 @@ def define(variant: Variant) -> wp.Kernel:
         wind_velocity: wp.array(dtype=vec3),
         wind_density: wp.array(dtype=scalar),
         wind_drag: wp.array(dtype=scalar),
+        gust: wp.array(dtype=vec3),
         # state in
         position: wp.array(dtype=vec3),
         velocity: wp.array(dtype=vec3),
@@ -50,6 +61,8 @@ def define(variant: Variant) -> wp.Kernel:
         n = wp.normalize(cross)
         mean_velocity = (velocity[i] + velocity[j] + velocity[k]) * third
         relative = wind_velocity[0] - mean_velocity
+        if wp.static(gusty):
+            relative += (gust[i] + gust[j] + gust[k]) * third
         v_n = wp.dot(n, relative)
         pressure = wind_density[0] * area * wp.abs(v_n)
         drag = wind_drag[0] * area

@@ -89,9 +89,9 @@ def test_faces_that_are_near() -> None:
     parts = [gradient(distance, places) for distance in parts_of("mesh")]
     gap, n = np.array([gap.numpy() for gap, _ in parts]).T, np.array([n.numpy() for _, n in parts]).swapaxes(0, 1)
     touch = law.distance + law.range
-    assert np.array_equal(np.bincount(near.node, minlength=CLOTH.nodes), (gap < touch).sum(axis=1))
+    assert np.array_equal(np.bincount(near.sample, minlength=CLOTH.nodes), (gap < touch).sum(axis=1))
     for node in range(CLOTH.nodes):
-        mine, its = near.node == node, gap[node] < touch
+        mine, its = near.sample == node, gap[node] < touch
         order, other = np.argsort(near.gap[mine]), np.argsort(gap[node, its])
         assert np.abs(near.gap[mine][order] - gap[node, its][other]).max(initial=0.0) < 1e-16
         # faces that meet in an edge are as near as each other, and from there in the same direction

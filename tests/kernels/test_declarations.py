@@ -20,7 +20,12 @@ STRUCTS = {"BlockMatrix", "SolverWork", "SolveReport", "NewtonControl", "StateAd
 STRUCTS |= {"Pairs", "Obstacles", "Faces", "Crimp"}
 MOST_ARGUMENTS = 16
 STAND_INS = {"pin_target_path", "pin_start", "applied_force_path", "inner_tolerance", "unit", "zero", "euler_zero"}
-"""Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint."""
+STAND_INS |= {
+    f"sample_{name}" for name in ("position", "velocity", "increment", "direction", "base_position", "solution")
+}
+STAND_INS |= {"sample_is_free", "sample_moves", "gravity_path", "wind_velocity_path", "origin"}
+"""Arrays that kernels know by another name: path, start, tolerance, rate, stage_adjoint; as of nodes; and what the
+kernel of a user's gusts takes."""
 
 
 def arguments(variant: Variant) -> list[tuple[str, str, object]]:

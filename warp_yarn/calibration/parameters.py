@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ..description.cloth import CLOTH_NUMBERS
 from ..description.scene import Scene
 from ..errors import InputError, real
-from ..simulation.state import CLOTH_NUMBERS
 
 OF_YARNS = ("density", "stretch", "bend")
 OF_CLOTHS = tuple(name for name in CLOTH_NUMBERS if name not in ("spacing", "radius"))
@@ -80,8 +80,10 @@ def learnable(scene: Scene) -> dict[str, int | None]:
         value = getattr(scene.cloth, name)
         result[name] = value.size if np.ndim(value) else None
     if scene.wind is not None:
-        result |= {"wind_velocity": 3, "wind_density": None, "wind_drag": None}
-    if scene.gravity is not None:
+        result |= {"wind_density": None, "wind_drag": None}
+        if np.shape(scene.wind.velocity) == (3,):
+            result["wind_velocity"] = 3
+    if scene.gravity is not None and np.shape(scene.gravity) == (3,):
         result["gravity"] = 3
     if len(scene.pins) and scene.pin_stiffness is not None:
         result["pin_stiffness"] = None
@@ -135,10 +137,12 @@ def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
             numbers[name].flat[k] = value
     changes["cloth"] = old.replace(yarns=yarns, pose=old.position, **numbers)
     if scene.wind is not None:
-        velocity: Any = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(scene.wind.velocity))
+        velocity: Any = scene.wind.velocity
+        if np.shape(velocity) == (3,):
+            velocity = tuple(parts.get(("wind_velocity", k), value) for k, value in enumerate(velocity))
         rest = {OF_WINDS[name]: parts[name, None] for name in ("wind_density", "wind_drag") if (name, None) in parts}
         changes["wind"] = dataclasses.replace(scene.wind, velocity=velocity, **rest)
-    if scene.gravity is not None:
+    if scene.gravity is not None and np.shape(scene.gravity) == (3,):
         changes["gravity"] = np.array([parts.get(("gravity", k), value) for k, value in enumerate(scene.gravity)])
     for name in ("pin_stiffness", "seam_stiffness"):
         if (name, None) in parts:

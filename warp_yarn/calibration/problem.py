@@ -55,7 +55,7 @@ class CalibrationProblem:
 
     Args:
         scene: the model; what is not learned keeps its values.
-        target: the frames.
+        target: the frames; where ``pin_path`` or ``forces`` change, every step of a run from its beginning.
         parameters: what to learn.
         frames: how many frames to compare with, at least 1; None: all that there are.
         first: the frame to start from.
@@ -253,6 +253,12 @@ def chosen_frames(scene: Scene, target: Trajectory, frames: int | None, first: i
         )
     for name in FIELDS:
         finite_array(f"target.{name}", getattr(target, name), (len(target), scene.cloth.nodes, STATE_TYPES[name]))
+    moves = scene.pin_path is not None or len(scene.force_path) > 1
+    if moves and (target.start, target.every) != (0, 1):
+        raise InputError(
+            f"target.start = {target.start:g} and every = {target.every:g}, must be 0 and 1: pin_path and forces of "
+            "the scene go by the target's frames; the arguments first and every take some of them"
+        )
     first, every = integer("first", first, least=0), integer("every", every, least=1)
     there = max(0, len(target) - 1 - first) // every
     wanted = there if frames is None else integer("frames", frames, least=1)
@@ -273,11 +279,11 @@ def steps_per_frame(frame_time: float, step: float) -> int:
 
 
 def with_paths(scene: Scene, start: np.ndarray, first: int | Fraction, ratio: Fraction, steps: int) -> Scene:
-    """Gives a scene the rows of ``pin_path`` and ``forces`` that a model needs whose steps are not the scene's rows.
+    """Gives a scene the rows of pins, forces, gravity and wind that a model needs whose steps are not its rows.
 
     Row k of a path is of the time from k to k + 1, in rows. The model's step j is of the time from first + j ratio to
-    first + (j + 1) ratio. Pins move linearly from row to row, and a force is its mean over the model's step: the motion
-    of the pins and the impulse of the forces are the same with every step.
+    first + (j + 1) ratio. Pins move linearly from row to row, and a force is its mean over the model's step, as gravity
+    and wind are: the motion of the pins and the impulse of the forces are the same with every step.
 
     Args:
         scene: the scene, left as it is.
@@ -296,15 +302,24 @@ def with_paths(scene: Scene, start: np.ndarray, first: int | Fraction, ratio: Fr
         moves = [np.interp(times[1:], np.arange(len(places)), of_time) for of_time in places.T]
         changes["pin_path"] = np.stack(moves, axis=1).reshape(steps, -1, 3)
     if len(scene.force_path) > 1:
-        last = len(scene.force_path) - 1
-        path = np.zeros((steps + 1, *scene.force_path.shape[1:]))
-        for j, (begin, end) in enumerate(itertools.pairwise(times)):
-            rows = np.arange(math.floor(begin), math.ceil(end))
-            share = (np.minimum(rows + 1, end) - np.maximum(rows, begin)) / (end - begin)
-            path[j] = np.tensordot(share, scene.force_path[np.clip(rows, 0, last)], axes=1)
+        path = _means(scene.force_path, times)
         forces = enumerate(scene.forces.items())
-        changes["forces"] = {node: f if f.ndim == 1 else path[:-1, k] for k, (node, f) in forces}
+        changes["forces"] = {node: path[:, k] if np.ndim(f) == 2 else f for k, (node, f) in forces}
+    if scene.gravity is not None and np.ndim(scene.gravity) == 2:
+        changes["gravity"] = _means(scene.gravity, times)
+    if scene.wind is not None and np.ndim(scene.wind.velocity) == 2:
+        changes["wind"] = scene.wind.replace(velocity=_means(np.asarray(scene.wind.velocity), times))
     return scene.replace(**changes)
+
+
+def _means(path: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Takes the means of rows, of which the last one stays, from each of these times to the next."""
+    result = np.zeros((len(times) - 1, *path.shape[1:]))
+    for j, (begin, end) in enumerate(itertools.pairwise(times)):
+        rows = np.arange(math.floor(begin), math.ceil(end))
+        share = (np.minimum(rows + 1, end) - np.maximum(rows, begin)) / (end - begin)
+        result[j] = np.tensordot(share, path[np.clip(rows, 0, len(path) - 1)], axes=1)
+    return result
 
 
 def _weave(cloth: Cloth | Cloths) -> Weave:

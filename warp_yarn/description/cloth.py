@@ -13,6 +13,7 @@ from ..errors import InputError, choice, finite_array, real
 from .cutting import Cut, cut
 from .outline import checked_outline
 from .places import Places
+from .sanity import warn_of_units
 from .topology import Topology, rectangle
 from .weave import Weave
 from .woven import (
@@ -139,6 +140,7 @@ class Cloth(Places):
             outline=self.outline,
             holes=self.holes,
         )
+        warn_of_units(self)
 
     def __repr__(self) -> str:
         if isinstance(self.spacing, float):

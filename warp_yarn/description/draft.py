@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError, finite_array, integer
 from .cloth import Cloth
+from .fixed import Replaceable, says_why
 from .weave import Weave
 from .woven import OF_CROSSINGS
 
@@ -27,8 +28,9 @@ Groups = Sequence[Sequence[int]]
 """Of each end its shafts, and the like; counted from 1, as weavers do."""
 
 
+@says_why
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Draft:
+class Draft(Replaceable):
     """What a loom weaves. Ends, picks, shafts and treadles count from 1 in what it is made of.
 
     Args:
@@ -81,7 +83,7 @@ class Draft:
     def from_weave(cls, weave: Weave) -> Draft:
         """Finds a loom for a weave: ends that move alike are on one shaft, picks that are alike have one treadle.
 
-        On the border of a weave nothing crosses; in the draft the ends are down there.
+        It has the border of the weave as that was given, though nothing crosses there.
         """
         if not isinstance(weave, Weave):
             raise InputError(f"weave = {weave!r}, must be a Weave")

@@ -8,7 +8,8 @@ import math
 import warnings
 from collections.abc import Mapping
 
-from ..errors import InputError, choice, real
+from ..errors import InputError, WarpYarnWarning, choice, real
+from .fixed import Replaceable, says_why
 
 TIGHTEST = math.pi / math.sqrt(12.0)
 """Packing of round fibres side by side as tightly as they go, 0.907."""
@@ -20,8 +21,9 @@ HEAVIEST = 1e4
 """tex: rovings for composites end below it."""
 
 
+@says_why
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fibre:
+class Fibre(Replaceable):
     """A kind of fibre.
 
     Args:
@@ -142,6 +144,7 @@ def sizes(
             warnings.warn(
                 f"a yarn of {tex:g} tex and this size is {full / section:.2g} fibre, the rest air: usual are 0.5 to "
                 f"0.8, and no more than {TIGHTEST:.2f} is possible. Sizes are in m, tex is g/km.",
+                WarpYarnWarning,
                 stacklevel=3,
             )
         return given
@@ -155,14 +158,15 @@ def sizes(
 def warn_of_counts(fibre: Fibre, tex: float, twist: float, angle: float) -> None:
     """Warns where a count or a twist makes no sense."""
     if tex < fibre.tex:
-        warnings.warn(
-            f"tex = {tex:g} is less than one fibre of {fibre.tex:g} tex. tex is g/km, 1e-6 kg/m.", stacklevel=3
-        )
+        text = f"tex = {tex:g} is less than one fibre of {fibre.tex:g} tex. tex is g/km, 1e-6 kg/m."
+        warnings.warn(text, WarpYarnWarning, stacklevel=3)
     if tex > HEAVIEST:
-        warnings.warn(f"tex = {tex:g} is a rope, of {tex * 1e-3:g} g a metre. tex is g/km, 1e-6 kg/m.", stacklevel=3)
+        text = f"tex = {tex:g} is a rope, of {tex * 1e-3:g} g a metre. tex is g/km, 1e-6 kg/m."
+        warnings.warn(text, WarpYarnWarning, stacklevel=3)
     if angle > STEEPEST:
         warnings.warn(
             f"twist = {twist:g} turns/m turns the fibres at the surface by {math.degrees(angle):.0f} degrees from the "
             "yarn's axis: yarns break before. A twist factor K [tex½/cm] makes 100 K/√tex turns/m.",
+            WarpYarnWarning,
             stacklevel=3,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,30 +14,40 @@ from ..kernels import TERMS, TermParameter, own
 from .cloth import Cloth
 from .cloths import Cloths, as_one
 from .crimp import check_crimp
-from .fixed import Fixed
+from .fixed import Fixed, Replaceable, says_why
 from .obstacles import Contact, Obstacle
+from .sanity import warn_of_acceleration, warn_of_speed
 from .seams import checked_seams
 from .selection import checked_parameters, selected_terms
+from .varying import checked_vectors, of_time
 
 
+@says_why
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Wind:
-    """A constant wind.
+class Wind(Replaceable):
+    """A wind.
 
     Args:
-        velocity: of the air [m/s], 3 numbers.
+        velocity: of the air [m/s]: 3 numbers; a row for every step [steps, 3], of which the last one stays; a function
+            of time [s], which gives 3 numbers; or gusts, a function of (position, time) that gives [nodes, 3] of
+            positions [nodes, 3] (m), or a ``wp.func`` of a node's position and the time, which is evaluated on the
+            device, in the simulator's precision. Functions are evaluated in the middle of each step, for all of it.
         density: ρ_w, of the pressure [kg/m³], at least 0.
         drag: c_d, of the tangential drag [kg/(m² s)], at least 0.
     """
 
-    velocity: tuple[float, float, float]
+    velocity: Any
     density: float = 2.0
     drag: float = 0.5
 
     def __post_init__(self) -> None:
         # copies: an array that the caller writes to again is not this wind
         keep = functools.partial(object.__setattr__, self)
-        keep("velocity", tuple(finite_array("wind velocity", self.velocity, (3,)).tolist()))
+        velocity: Any = checked_vectors("wind velocity", self.velocity)
+        if isinstance(velocity, np.ndarray):
+            velocity = tuple(velocity.tolist() if velocity.ndim == 1 else map(tuple, velocity.tolist()))
+        warn_of_speed(velocity)
+        keep("velocity", velocity)
         keep("density", real("wind density", self.density, least=0.0))
         keep("drag", real("wind drag", self.drag, least=0.0))
 
@@ -48,14 +58,15 @@ class Scene(Fixed):
 
     Args:
         cloth: the cloth, or several, whose nodes are numbered on from one to the next (``Cloths``).
-        gravity: acceleration [m/s²], 3 numbers, or None.
+        gravity: acceleration [m/s²], 3 numbers; a row for every step [steps, 3], of which the last one stays; a
+            function of time, as of a wind's; or None.
         wind: a Wind, or None.
         pins: nodes that are held, such as ``cloth.corners("top")``.
         pin_stiffness: k_h of a pin's spring [N/m], above 0, or None: held exactly.
         pin_path: where the pins are to be at the end of each step [steps, pins, 3] (m); they stay at the last place.
             None: where the pose has them.
-        forces: forces on nodes [N]: {node: 3 numbers, or steps × 3}. After its last step a force is 0; one that is
-            given by 3 numbers does not end.
+        forces: forces on nodes [N]: {node: 3 numbers, or steps × 3, or a function of time}. After its last step a force
+            is 0; one that is given by 3 numbers does not end.
         sliding: whether yarns slide along each other. Without, nodes have 3 degrees of freedom, (u, v) stays at rest,
             and friction, parallel yarns, inertia and mass rate have no part.
         terms: the terms to model, by name; None: all that the scene has a use for, and of those that were registered
@@ -80,7 +91,7 @@ class Scene(Fixed):
         self,
         cloth: Cloth | Cloths | Sequence[Cloth],
         *,
-        gravity: Sequence[float] | None = (0.0, 0.0, -9.8),
+        gravity: Any = (0.0, 0.0, -9.8),
         wind: Wind | None = None,
         pins: Sequence[int] = (),
         pin_stiffness: float | None = 1e4,
@@ -101,7 +112,7 @@ class Scene(Fixed):
         if wind is not None and not isinstance(wind, Wind):
             raise InputError(f"wind = {wind!r}, must be a Wind or None")
         self.cloth = as_one(cloth)
-        self.gravity = None if gravity is None else finite_array("gravity", gravity, (3,))
+        self.gravity = None if gravity is None else of_time("gravity", checked_vectors("gravity", gravity))
         self.wind = wind
         self.pins = indices("pins", pins, self.cloth.nodes, "node")
         self.pin_stiffness = None if pin_stiffness is None else real("pin_stiffness", pin_stiffness, above=0.0)
@@ -109,6 +120,7 @@ class Scene(Fixed):
         if self.pin_path is not None and len(self.pin_path) == 0:
             raise InputError("pin_path has no step, must have at least one")
         checked = _checked_forces(forces)
+        self.functions = _functions(self.gravity, wind, checked)
         self.force_nodes = indices("forces", list(checked), self.cloth.nodes, "node")
         self.force_path = _force_path(checked)
         self.seams = checked_seams(seams, self.cloth.nodes)
@@ -130,6 +142,7 @@ class Scene(Fixed):
         self.crimp_interchange = bool(crimp_interchange)
         check_crimp(self.cloth, contact_force, self.crimp_interchange)
         self.terms = selected_terms(self, terms)
+        warn_of_acceleration(self.gravity)
         self._fix(
             cloth=self.cloth,
             gravity=self.gravity,
@@ -182,13 +195,13 @@ class Scene(Fixed):
         return np.broadcast_to(value, (len(self.cloth.yarns),)) if parameter.of == "yarn" else value
 
     @property
-    def forces(self) -> dict[int, np.ndarray]:
-        """Forces on nodes [N]: {node: 3 numbers, or steps × 3}, the argument that would give these."""
-        result = {}
+    def forces(self) -> dict[int, Any]:
+        """Forces on nodes [N]: {node: 3 numbers, or steps × 3, or a function}, the argument that would give these."""
+        result: dict[int, Any] = {}
         for k, node in enumerate(self.force_nodes.tolist()):
             path = self.force_path[:, k]
             result[node] = path[-1] if (path == path[-1]).all() else path[:-1]
-        return result
+        return result | {node: function for node, function in self.functions.items() if isinstance(node, int)}
 
     def same_as(self, other: Scene) -> bool:
         """Tells whether another one asks for the same motion."""
@@ -196,7 +209,7 @@ class Scene(Fixed):
         def values(scene: Scene) -> list[np.ndarray]:
             missing = np.zeros(0)
             arrays = [scene.seams, scene.gravity, scene.pins, scene.pin_path, scene.force_nodes, scene.force_path]
-            return [missing if array is None else array for array in arrays]
+            return [missing if array is None or callable(array) else array for array in arrays]
 
         names = (
             "wind",
@@ -216,13 +229,24 @@ class Scene(Fixed):
             and len(self.obstacles) == len(other.obstacles)
             and all(mine.same_as(its) for mine, its in zip(self.obstacles, other.obstacles, strict=True))
             and self.contact == other.contact
+            and self.functions == other.functions
             and all(getattr(self, name) == getattr(other, name) for name in names)
             and all(np.array_equal(a, b) for a, b in zip(values(self), values(other), strict=True))
         )
 
 
-def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
-    """Gives {node: 3 numbers, or steps × 3}."""
+def _functions(gravity: Any, wind: Wind | None, forces: dict[int, Any]) -> dict[str | int, Callable]:
+    """Collects what is given by functions: "gravity", "wind", and nodes of forces."""
+    given: list[tuple[str | int, Any]] = [
+        ("gravity", gravity),
+        ("wind", None if wind is None else wind.velocity),
+        *forces.items(),
+    ]
+    return {name: value for name, value in given if callable(value)}
+
+
+def _checked_forces(forces: Any) -> dict[int, Any]:
+    """Gives {node: 3 numbers, or steps × 3, or a function of time}."""
     if forces is None:
         return {}
     if not isinstance(forces, Mapping):
@@ -230,6 +254,9 @@ def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
     result = {}
     for node, value in forces.items():
         name = f"forces[{node!r}]"
+        if callable(value):
+            result[node] = of_time(name, value)
+            continue
         try:
             steps = np.ndim(value) == 2
         except ValueError as error:  # ragged
@@ -239,10 +266,11 @@ def _checked_forces(forces: Any) -> dict[int, np.ndarray]:
     return result
 
 
-def _force_path(forces: dict[int, np.ndarray]) -> np.ndarray:
-    """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays."""
-    steps = max((len(value) for value in forces.values() if value.ndim == 2), default=0)
+def _force_path(forces: dict[int, Any]) -> np.ndarray:
+    """Makes the path [steps + 1, nodes with a force, 3]; the last row is what stays. What is a function is 0 there."""
+    rows = [np.zeros(3) if callable(value) else value for value in forces.values()]
+    steps = max((len(value) for value in rows if value.ndim == 2), default=0)
     path = np.zeros((steps + 1, len(forces), 3))
-    for k, value in enumerate(forces.values()):
+    for k, value in enumerate(rows):
         path[: len(value) if value.ndim == 2 else steps + 1, k] = value
     return path

@@ -38,6 +38,8 @@ def sewn(topology: Topology, seams: np.ndarray) -> tuple[Topology, np.ndarray]:
     Raises:
         InputError: a node that is sewn to too many others.
     """
+    if not len(seams):
+        return topology, np.zeros(0, dtype=np.int32)
     neighbour: np.ndarray = np.full((topology.nodes, WIDTH), -1, dtype=np.int32)
     neighbour[:, :6] = topology.neighbour
     # every slot is one lower neighbour at most, too

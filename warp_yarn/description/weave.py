@@ -10,9 +10,10 @@ import numpy as np
 
 from ..errors import InputError, choice, integer
 from . import notation
+from .fixed import Fixed
 
 
-class Weave:
+class Weave(Fixed):
     """The draft of a cloth of rows × columns crossing nodes.
 
     The face of a cloth is the side where a flipped crossing has its warp yarn on top: z+ of a flat cloth, y+ of an
@@ -23,6 +24,10 @@ class Weave:
         draft: 0/1 array, rows × columns, at least 3 × 3. 1 where the crossing is flipped: the weft passes on the other
             side of the warp than at a 0. Border nodes are yarn ends, where nothing crosses: their entries count as 0.
         name: what to call it in messages and files.
+
+    Attributes:
+        flipped: the draft, with 0 on the border [rows, columns].
+        draft: the draft as given, whose border pictures show [rows, columns].
     """
 
     def __init__(self, draft: Any, name: str = "draft"):
@@ -38,10 +43,12 @@ class Weave:
             raise InputError(
                 f"a weave of {flipped.shape[0]} × {flipped.shape[1]} has no crossing inside, must be at least 3 × 3"
             )
+        self.draft = flipped.copy()
+        self.draft.setflags(write=False)
         self.flipped = np.zeros_like(flipped)
         self.flipped[1:-1, 1:-1] = flipped[1:-1, 1:-1]
-        self.flipped.setflags(write=False)
         self.name = name
+        self._fix(draft=self.draft, name=name)
 
     @property
     def rows(self) -> int:
@@ -90,8 +97,8 @@ class Weave:
 
     @property
     def warp_on_top(self) -> np.ndarray:
-        """The drawdown, as of ``from_drawdown`` [columns, rows]. On the border, where nothing crosses, False."""
-        return self.flipped[::-1].T
+        """The drawdown, as of ``from_drawdown`` [columns, rows], on the border too, where nothing crosses."""
+        return self.draft[::-1].T
 
     def drawdown(self, path: str | os.PathLike) -> None:
         """Draws it as weavers do: see ``wy.write_drawdown``."""

@@ -8,13 +8,15 @@ import math
 
 from ..errors import InputError, finite_array, real
 from . import fibre as fibres
+from .fixed import Replaceable, says_why
 
 SIZES = ("radius", "width", "thickness")
 """Sizes that a yarn may have of its own."""
 
 
+@says_why
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Yarn:
+class Yarn(Replaceable):
     """A yarn material (paper, table 1).
 
     A yarn may have a size of its own: either radius, or both width and thickness, the axes of its elliptic section. The

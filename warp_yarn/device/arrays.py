@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..description.cloth import Cloth
+from ..description.cloth import CLOTH_NUMBERS, Cloth
 from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
@@ -18,7 +18,6 @@ from ..description.seams import sewn
 from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
-from ..simulation.state import CLOTH_NUMBERS
 from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
@@ -43,14 +42,16 @@ class Arrays(DeclaredArrays):
         self.terms: list[Term] = [TERMS[name] for name in scene.terms]
         self.contact = any(term.needs_contact for term in self.terms)
         self.stencil = max(term.stencil for term in self.terms)
+        if scene.contact.samples != "nodes":
+            # a middle couples the ends of its segment
+            self.stencil = max(self.stencil, 2)
         # Single precision far from 0 would lose the cloth itself: a kilometre away its unit is 60 µm. What is
         # differentiated by positions stays where it is.
         near = variant.scalar is wp.float32 and not variant.reverse
         self.origin = scene.cloth.position.mean(axis=0) if near else np.zeros(3)
-        self.topology, self.seam_block = scene.cloth.topology, np.zeros(0, dtype=np.int32)
-        if "seams" in scene.terms:
-            self.topology, self.seam_block = sewn(self.topology, scene.seams)
-        topology = self.topology
+        seams = scene.seams if "seams" in scene.terms else scene.seams[:0]
+        topology, self.seam_block = sewn(scene.cloth.topology, seams)
+        self.topology = topology
         sizes = {
             "world": 1,
             "cloth": 1,
@@ -64,13 +65,15 @@ class Arrays(DeclaredArrays):
             "triangle": len(topology.triangle_nodes),
             "seam": len(self.seam_block),
             "pin": len(scene.pins),
+            "gravity step": _rows(scene.gravity),
+            "wind step": 1 if scene.wind is None else _rows(scene.wind.velocity),
             "pin step": 0 if scene.pin_path is None else scene.pin_path[..., 0].size,
             "applied": len(scene.force_nodes),
             "applied step": scene.force_path[..., 0].size,
             **contact.sizes(scene),
         }
         dims = {f"{name}s": sizes[name] for name in ("node", "segment", "bend", "crossing", "triangle", "seam", "pin")}
-        dims |= {"applied": sizes["applied"], "obstacles": sizes["obstacle"], "node_obstacles": sizes["node obstacle"]}
+        dims |= contact.dims(sizes) | {"applied": sizes["applied"]}
         super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)
@@ -127,9 +130,9 @@ class Arrays(DeclaredArrays):
             self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
         self._cloth_numbers(cloth)
         if scene.gravity is not None:
-            self["gravity"] = self.numbers(scene.gravity[None])
+            self._vectors("gravity", scene.gravity)
         if scene.wind is not None:
-            self["wind_velocity"] = self.numbers(np.asarray(scene.wind.velocity)[None])
+            self._vectors("wind_velocity", scene.wind.velocity)
             self["wind_density"] = self.numbers(scene.wind.density)
             self["wind_drag"] = self.numbers(scene.wind.drag)
         if "seams" in self.conditions:
@@ -156,6 +159,13 @@ class Arrays(DeclaredArrays):
             self.declare(name, Field(element, 1, kind, parameter.unit, "always", "of a term from outside the package"))
             value = scene.registered_value(name)
             self[name] = self.numbers(value[cloth.material] if parameter.of == "yarn" else value[None])
+
+    def _vectors(self, name: str, value: Any) -> None:
+        """Sets a vector, and the rows of one that changes; what a function says comes before each step."""
+        rows = np.zeros((1, 3)) if callable(value) else np.asarray(value).reshape(-1, 3)
+        self[name] = self.numbers(rows[:1])
+        if np.ndim(value) == 2:
+            self[f"{name}_path"] = self.numbers(rows)
 
     def _cloth_numbers(self, cloth: Cloth | Cloths) -> None:
         """Fill what a cloth says in numbers: single ones, or in a general cloth those of every segment, yarn, ..."""
@@ -218,6 +228,11 @@ class Arrays(DeclaredArrays):
         self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
         self.dims["coarse_warp_lines"] = found.coarse_warp_lines
         self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
+
+
+def _rows(value: Any) -> int:
+    """Counts the steps for which a vector is given; 1 of one that does not change."""
+    return len(value) if np.ndim(value) == 2 else 1
 
 
 def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:

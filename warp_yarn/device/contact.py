@@ -12,8 +12,9 @@ from ..description.obstacles import TriangleMesh
 from ..description.scene import Scene
 from ..errors import InputError
 from ..kernels.contact import distances
-from . import declarations
+from . import contact_declarations, samples
 from .energy_watch import AT_START
+from .samples import Samples
 
 if TYPE_CHECKING:
     from .arrays import Arrays
@@ -26,14 +27,18 @@ NEAR_MARGIN = 0.5
 OBSTACLE_PATHS = ("obstacle_position_path", "obstacle_rotation_path")
 PLACED = ("obstacle_position", "obstacle_rotation", "obstacle_velocity", "obstacle_spin")
 """Arrays that follow from the paths at the time of a stage."""
-NEAR_ROOM, FACE_ROOM = 32, 16
-"""Nodes and faces near each node that there is room for at first."""
+SAMPLED = ("position", "velocity", "increment")
+"""Arrays of nodes that contact reads."""
+NEAR_ROOM, FACE_ROOM = 8, 16
+"""Samples and faces near each sample that there is room for at first."""
+SAMPLES_A_NODE = 3.0
+"""With middles: a node has two segments, but at the border."""
 
 
 class Near(NamedTuple):
-    """What is near each other: a node with another one, or with an obstacle, the other of which is -1 then."""
+    """What is near each other: a sample with another one, or with an obstacle, the other of which is -1 then."""
 
-    node: np.ndarray
+    sample: np.ndarray
     other: np.ndarray
     obstacle: np.ndarray
     gap: np.ndarray
@@ -43,16 +48,24 @@ class Near(NamedTuple):
 
 def sizes(scene: Scene) -> dict[str, int]:
     """Count what the contact of a scene has."""
-    several = scene.obstacles
+    several, nodes = scene.obstacles, scene.cloth.nodes
+    samples = nodes if scene.contact.samples == "nodes" else nodes + len(scene.cloth.topology.segment_nodes)
     faces = sum(len(obstacle.faces) for obstacle in several if isinstance(obstacle, TriangleMesh))
     return {
         "obstacle": len(several),
         "obstacle step": _steps(scene) * len(several),
-        "node obstacle": len(several) * scene.cloth.nodes,
+        "sample": samples,
         "face": max(faces, 1),
         "near": 0,
-        "near face": FACE_ROOM * scene.cloth.nodes if faces else 0,
+        "touch": 0,
+        "near face": FACE_ROOM * samples if faces else 0,
     }
+
+
+def dims(sizes: dict[str, int]) -> dict[str, int]:
+    """Count what kernels of contact run over, by ``sizes``."""
+    samples, obstacles = sizes["sample"], sizes["obstacle"]
+    return {"obstacles": obstacles, "samples": samples, "sample_obstacles": samples * obstacles}
 
 
 def _steps(scene: Scene) -> int:
@@ -72,15 +85,22 @@ def set_arrays(arrays: Arrays) -> None:
         _set_law(arrays, "self_contact", distance, reach)
         arrays["contact_friction"] = arrays.numbers(contact.friction)
         arrays["near_margin"] = arrays.numbers(NEAR_MARGIN * cloth.longest_spacing)
-        arrays["rest_place"] = arrays.numbers(cloth.rest_place.ravel())
-    arrays["near_room"] = 0
+        place = cloth.rest_place
+        if "middles" in arrays.conditions:
+            place = np.concatenate([place, place[cloth.topology.segment_nodes].mean(axis=1)])
+        arrays["rest_place"] = arrays.numbers(place.ravel())
+    if "middles" in arrays.conditions:
+        samples.set_arrays(arrays)
+    arrays["near_room"] = arrays["touch_room"] = 0
     arrays["face_room"] = FACE_ROOM if arrays.sizes["near face"] else 0
-    arrays.make(declarations.CONTACT)
+    arrays.make(contact_declarations.CONTACT)
 
 
 def _set_law(arrays: Arrays, kind: str, distance: float, reach: float) -> None:
     contact = arrays.scene.contact
-    stiffness = contact.stiffness or arrays.node_mass() * (SPEED / reach) ** 2
+    # all that touches is as stiff, of however many samples
+    more = 1.0 if contact.samples == "nodes" else SAMPLES_A_NODE ** (1 if kind == "contact" else 2)
+    stiffness = contact.stiffness or arrays.node_mass() / more * (SPEED / reach) ** 2
     arrays[f"{kind}_stiffness"] = arrays.numbers(stiffness)
     arrays[f"{kind}_distance"] = arrays.numbers(distance)
     arrays[f"{kind}_range"] = arrays.numbers(reach)
@@ -142,6 +162,8 @@ class Contact:
         obstacles_move: whether any obstacle has a path.
         damps_impacts: whether a method that has a fallback leaves steps with an impact to it.
         has_mesh: whether any is a mesh.
+        samples: what touches.
+        last: the last of its terms, or None.
     """
 
     damps_impacts = True
@@ -152,6 +174,8 @@ class Contact:
         self.obstacles, self.self_contact = "obstacles" in scene.terms, "self_contact" in scene.terms
         self.on = self.obstacles or self.self_contact
         self.obstacles_move = "obstacles move" in model.arrays.conditions
+        self.samples = Samples(model)
+        self.last = next((term for term in reversed(model.arrays.terms) if term.touches), None)
         self._tapes: dict[int, wp.Tape] = {}
         self.has_mesh = "meshes" in scene.terms
         if self.self_contact:
@@ -161,42 +185,53 @@ class Contact:
             self._reach = float(a["self_contact_distance"].numpy()[0] + a["self_contact_range"].numpy()[0])
             side = int(np.clip(np.sqrt(cloth.nodes) * cloth.longest_spacing / self._reach, 8, 128))
             self.grid = wp.HashGrid(side, side, side, device=a.device, dtype=a.variant.scalar)
-            self.grid.reserve(cloth.nodes)
+            self.grid.reserve(self.samples.count)
             self.make_room(NEAR_ROOM)
 
     def make_room(self, room: int | None = None) -> None:
-        """Make room for so many nodes near each, or twice as many nodes and faces as there is; the next look makes a
-        list."""
+        """Make room for so many samples near each, or for twice as many of what is full, and twice as many faces; the
+        next look makes a list. Where a later matrix has counted anew since, twice as many of both."""
         a = self.model.arrays
         if self.self_contact:
-            a["near_room"] = room or 2 * a["near_room"]
-            a.sizes["near"] = a["near_room"] * a["nodes"]
-            a["near"], a["near_block"] = a.new("near"), a.new("near_block")
+            # of what is near, half may touch
+            kinds = {"near": (1, ("near",)), "touch": (2, ("touch", "touch_block"))}
+            full = [kind for kind in kinds if int(a[f"{kind}_count"].numpy().max()) >= a[f"{kind}_room"]]
+            for kind in kinds if room else full or kinds:
+                part, arrays = kinds[kind]
+                a[f"{kind}_room"] = max(room // part, 1) if room else 2 * a[f"{kind}_room"]
+                a.sizes[kind] = a[f"{kind}_room"] * self.samples.count
+                for name in arrays:
+                    a[name] = a.new(name)
             # far from everywhere
             a["near_position"].fill_(np.nan)
         if self.has_mesh and room is None:
             a["face_room"] *= 2
-            a.sizes["near face"] = a["face_room"] * a["nodes"]
+            a.sizes["near face"] = a["face_room"] * self.samples.count
             a["near_face"] = a.new("near_face")
 
-    def find(self) -> None:
-        """Look for what contact needs to know of the present positions."""
-        if self.on:
-            self.model.arrays.zero("touching")
+    def find(self, *, matrix: bool = False) -> None:
+        """Look for what contact needs to know of the present positions, before any of its terms."""
+        if not (self.on or self.has_mesh):
+            return
+        self.model.arrays.zero("touching")
+        self.samples.clear(matrix=matrix)
+        place = {name: array for name, array in self.samples.of(*SAMPLED).items() if name == "position"}
         if self.has_mesh:
-            self.model.launch("find_faces", "nodes")
+            self.model.launch("find_faces", "samples", **place)
         if self.self_contact:
             self._keep_list(moves=False)
 
     def _keep_list(self, *, moves: bool) -> None:
-        """Make a new list of what is near where nodes have moved too far for the last, or would by a step."""
-        self.model.launch("measure_stray", "nodes", moves=int(moves))
+        """Make a new list of what is near where samples have moved too far for the last, or would by a step."""
+        arrays = self.samples.standing_in("position", "direction")
+        self.model.launch("measure_stray", "samples", moves=int(moves), nodes=self.samples.count, **arrays)
         wp.capture_if(self.model.arrays["outdated"], on_true=self._list_near)
 
     def _list_near(self) -> None:
-        a = self.model.arrays
-        self.grid.build(a["position"], self._reach + float(a["near_margin"].numpy()[0]))
-        self.model.launch("list_near", "nodes", grid=self.grid.id)
+        a, place = self.model.arrays, self.samples.standing_in("position")
+        reach = self._reach + float(a["near_margin"].numpy()[0])
+        self.grid.build(place.get("position", a["position"]), reach)
+        self.model.launch("list_near", "samples", grid=self.grid.id, **place)
 
     def keep_clear(self) -> None:
         """Let a stage's iteration start where nothing penetrates."""
@@ -206,23 +241,30 @@ class Contact:
             end = "_before" if self.obstacles_move else ""
             before = {f"obstacle_{part}_before": a[f"obstacle_{part}{end}"] for part in ("position", "rotation")}
             self.model.launch("start_outside", "nodes", **before)
+            self.samples.start_outside(**before)
         if self.self_contact:
             self.model.launch("aim", "nodes")
             self._limit_to_pairs()
             self.model.launch("start_apart", "nodes")
-            self.model.launch("check_apart", "nodes")
+            arrays = self.samples.of("position", "base_position", "solution") | self.samples.standing_in("is_free")
+            self.model.launch("check_apart", "samples", nodes=self.samples.count, **arrays)
 
     def limit_step(self) -> None:
         """Shorten a step of the iteration so that nothing penetrates."""
         if self.obstacles:
-            self.model.launch("limit_to_obstacles", "node_obstacles")
+            arrays = self.samples.of("position", "direction")
+            if arrays:
+                arrays["is_free"] = self.model.arrays["sample_moves"]
+            self.model.launch("limit_to_obstacles", "sample_obstacles", **arrays)
         if self.self_contact:
             self._limit_to_pairs()
 
     def _limit_to_pairs(self) -> None:
+        arrays = self.samples.of("position", "direction")
         self._keep_list(moves=True)
-        self.model.launch("limit_to_list", "nodes")
-        self.model.launch("limit_to_pairs", "nodes")
+        of_list = {name: array for name, array in arrays.items() if name == "direction"}
+        self.model.launch("limit_to_list", "samples", nodes=self.samples.count, **of_list)
+        self.model.launch("limit_to_pairs", "samples", **arrays)
 
     def ask_for_matrix(self) -> None:
         """Ask for a new matrix where anything touches."""
@@ -236,10 +278,11 @@ class Contact:
             self.model.launch("refuse_impact", 1)
 
     def _note_impacts(self) -> None:
+        arrays = self.samples.of(*SAMPLED)
         if self.obstacles:
-            self.model.launch("note_obstacle_impacts", "node_obstacles")
+            self.model.launch("note_obstacle_impacts", "sample_obstacles", **arrays)
         if self.self_contact:
-            self.model.launch("note_pair_impacts", "nodes")
+            self.model.launch("note_pair_impacts", "samples", **arrays)
 
     def load(self, stage: int) -> None:
         """Put obstacles where they are at the time of a stage, and note where they were at that of the state before."""
@@ -266,49 +309,47 @@ class Contact:
     def add_power(self) -> None:
         """Add the power of moving obstacles to ``power``."""
         if self.obstacles_move:
-            self.model.launch("add_obstacle_power", "node_obstacles")
+            arrays = self.samples.of("position", "velocity")
+            self.model.launch("add_obstacle_power", "sample_obstacles", **arrays)
             if self.has_mesh:
-                self.model.launch("add_mesh_power", "nodes")
+                self.model.launch("add_mesh_power", "samples", **arrays)
 
     # -- reports -----------------------------------------------------------------------------------------------------
 
     def near_obstacles(self) -> Near:
-        """Report every node and obstacle, and their force."""
-        nodes, several = self.model.scene.cloth.nodes, len(self.model.scene.obstacles)
-        self.find()
-        gaps, forces = self._reported("report_contacts", "node_obstacles", nodes * several)
-        node, obstacle = np.divmod(np.arange(nodes * several), max(several, 1))
-        return Near(node, np.full_like(node, -1), obstacle, gaps[:, 3], gaps[:, :3], forces)
+        """Report every sample and obstacle, and their force."""
+        several = len(self.model.scene.obstacles)
+        every = np.arange(self.samples.count * several)
+        gaps, forces = self._reported("report_contacts", "sample_obstacles", len(every))
+        sample, obstacle = np.divmod(every, max(several, 1))
+        return Near(sample, np.full_like(sample, -1), obstacle, gaps[:, 3], gaps[:, :3], forces)
 
     def near_faces(self) -> Near:
-        """Report every node and face of a mesh that are near each other, and their force."""
-        a, nodes = self.model.arrays, self.model.scene.cloth.nodes
-        self.find()
-        room = a["face_room"]
-        gaps, forces = self._reported("report_faces", "nodes", nodes * room)
-        node, slot = np.divmod(np.arange(nodes * room), room)
-        kept = slot < a["face_count"].numpy()[node]
+        """Report every sample and face of a mesh that are near each other, and their force."""
+        a, room = self.model.arrays, self.model.arrays["face_room"]
+        gaps, forces = self._reported("report_faces", "samples", self.samples.count * room)
+        sample, slot = np.divmod(np.arange(self.samples.count * room), room)
+        kept = slot < a["face_count"].numpy()[sample]
         obstacle = a["face_obstacle"].numpy()[a["near_face"].numpy()[kept]]
-        node = node[kept]
-        return Near(node, np.full_like(node, -1), obstacle, gaps[kept, 3], gaps[kept, :3], forces[kept])
+        sample = sample[kept]
+        return Near(sample, np.full_like(sample, -1), obstacle, gaps[kept, 3], gaps[kept, :3], forces[kept])
 
     def near_pairs(self) -> Near:
-        """Report every two nodes that are near each other, and their force."""
-        a, nodes = self.model.arrays, self.model.scene.cloth.nodes
-        self.find()
-        room = a["near_room"]
-        gaps, forces = self._reported("report_pairs", "nodes", nodes * room)
-        node, slot = np.divmod(np.arange(nodes * room), room)
+        """Report every two samples that are near each other, and their force."""
+        a, room = self.model.arrays, self.model.arrays["near_room"]
+        gaps, forces = self._reported("report_pairs", "samples", self.samples.count * room)
+        sample, slot = np.divmod(np.arange(self.samples.count * room), room)
         other = a["near"].numpy()
-        kept = (slot < a["near_count"].numpy()[node]) & (node < other)
-        node, other = node[kept], other[kept]
-        return Near(node, other, np.full_like(node, -1), gaps[kept, 3], gaps[kept, :3], forces[kept])
+        kept = (slot < a["near_count"].numpy()[sample]) & (sample < other)
+        sample, other = sample[kept], other[kept]
+        return Near(sample, other, np.full_like(sample, -1), gaps[kept, 3], gaps[kept, :3], forces[kept])
 
     def _reported(self, kernel: str, elements: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+        self.find()
         a = self.model.arrays
         arrays: dict[str, Any] = {
             "gaps": a.zeros(count, a.variant.vec4),
             "contact_forces": a.zeros(count, a.variant.vec3),
         }
-        self.model.launch(kernel, elements, **arrays)
+        self.model.launch(kernel, elements, **arrays, **self.samples.standing_in("position", "velocity"))
         return arrays["gaps"].numpy(), arrays["contact_forces"].numpy()

@@ -2,13 +2,13 @@
 
 Arrays are made from these declarations (``arrays.py``), and no other name can be set or launched with. A test holds
 every argument of every kernel to them (``tests/kernels/test_declarations.py``). A group is what is made together.
-One **world** is one independent simulation of a batch. Today there is one; what steers it (status, step length,
-tolerances, counters) is an array over worlds all the same.
+One **world** is one independent simulation of a batch, today the only one: what steers it is an array over worlds.
 The field ``when`` names a condition of the scene (``fields.conditions``). Where it does not hold the name is None.
 """
 
 import dataclasses
 
+from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
 from .fields import Field, Group
 
 TOPOLOGY: Group = {
@@ -55,8 +55,10 @@ one (``kernels/core/general.py``) four gaps of each node, three halves of each y
 as many cloth crossings as nodes."""
 
 INPUTS: Group = {
-    "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g"),
-    "wind_velocity": Field("world", 1, "vec3", "m/s", "has wind", "of the air"),
+    "gravity": Field("world", 1, "vec3", "m/s²", "has gravity", "g, in this step"),
+    "gravity_path": Field("gravity step", 1, "vec3", "m/s²", "gravity changes", "in every step"),
+    "wind_velocity": Field("world", 1, "vec3", "m/s", "has wind", "of the air, in this step"),
+    "wind_velocity_path": Field("wind step", 1, "vec3", "m/s", "wind changes", "in every step"),
     "wind_density": Field("world", 1, "scalar", "kg/m³", "has wind", "ρ_w"),
     "wind_drag": Field("world", 1, "scalar", "kg/(m² s)", "has wind", "c_d"),
     "seam_stiffness": Field("world", 1, "scalar", "N/m", "seams", "k of every pair of nodes that is sewn together"),
@@ -95,6 +97,7 @@ STEP: Group = {
 ASSEMBLY: Group = {
     "normal": Field("node", 1, "vec3", "", "contact", "from warp to weft, 0 on the border"),
     "contact_load": Field("node", 1, "scalar", "N", "contact", "what presses warp and weft together, where above 0"),
+    "gust": Field("node", 1, "vec3", "m/s", "gusts", "velocity of the air at a node, beside wind_velocity"),
     "force": Field("node", 1, "vec3", "N", "always", "F of the positions"),
     "euler_force": Field("node", 2, "scalar", "N", "sliding", "F of (u, v), but for friction"),
     "friction_force_out": Field("node", 2, "scalar", "N", "friction", "friction's F of (u, v)"),
@@ -176,61 +179,6 @@ LEVELS: Group = {
     "coarse_z": Field("coarse node", 1, "vec3", "m/s", "always", "preconditioned residual"),
 }
 """Of the multilevel preconditioner (``description/levels.py``): one struct, ``arrays["levels"]``."""
-
-CONTACT: Group = {
-    "touching": Field("world", 3, "int", "", "always", "whether anything touches, two nodes, anything so fast"),
-    "obstacle_velocity": Field("obstacle", 1, "vec3", "m/s", "obstacles", "ṗ"),
-    "obstacle_spin": Field("obstacle", 1, "vec3", "rad/s", "obstacles", "ω"),
-    "face_room": Field("count", 1, "int", "", "always", "places of a node in the list of faces that are near"),
-    "face_count": Field("node", 1, "int", "", "obstacles", "how many of them are taken"),
-    "near_face": Field("near face", 1, "int", "", "obstacles", "faces that are near it, of all meshes"),
-    "near_room": Field("count", 1, "int", "", "always", "places of a node in the list of what is near"),
-    "near_count": Field("node", 1, "int", "", "self-contact", "how many of them are taken"),
-    "near": Field("near", 1, "int", "", "self-contact", "nodes that are near it"),
-    "near_block": Field("near", 1, "sym33", "kg", "self-contact", "matrix block of those that touch it, or 0"),
-    "near_position": Field("node", 1, "vec3", "m", "self-contact", "where nodes were when the list was made"),
-    "outdated": Field("world", 1, "int", "", "self-contact", "whether it has to be made anew"),
-}
-"""What contact finds (``kernels/contact``)."""
-
-CONTACT_INPUTS: Group = {
-    "contact_stiffness": Field("world", 1, "scalar", "N/m", "obstacles", "κ of nodes on obstacles"),
-    "contact_distance": Field("world", 1, "scalar", "m", "obstacles", "D"),
-    "contact_range": Field("world", 1, "scalar", "m", "obstacles", "d̂"),
-    "contact_slip_speed": Field("world", 1, "scalar", "m/s", "obstacles", "ε"),
-    "contact_damping_speed": Field("world", 1, "scalar", "m/s", "obstacles", "v_d"),
-    "self_contact_stiffness": Field("world", 1, "scalar", "N/m", "self-contact", "κ of nodes on nodes"),
-    "self_contact_distance": Field("world", 1, "scalar", "m", "self-contact", "D"),
-    "self_contact_range": Field("world", 1, "scalar", "m", "self-contact", "d̂"),
-    "self_contact_slip_speed": Field("world", 1, "scalar", "m/s", "self-contact", "ε"),
-    "self_contact_damping_speed": Field("world", 1, "scalar", "m/s", "self-contact", "v_d"),
-    "contact_friction": Field("world", 1, "scalar", "", "self-contact", "μ of cloth on cloth"),
-    "near_margin": Field("world", 1, "scalar", "m", "self-contact", "beyond D + d̂ of the list of what is near"),
-    "rest_place": Field("node", 2, "scalar", "m", "self-contact", "(u, v) at rest, far apart on different cloths"),
-    "obstacle_shape": Field("obstacle", 1, "int", "", "obstacles", "as contact/distances.py numbers them"),
-    "obstacle_size": Field("obstacle", 1, "vec3", "m", "obstacles", "what a shape has for numbers"),
-    "obstacle_friction": Field("obstacle", 1, "scalar", "", "obstacles", "μ"),
-    "obstacle_position": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of a stage"),
-    "obstacle_rotation": Field("obstacle", 1, "quat", "", "obstacles", "R"),
-    "obstacle_position_before": Field("obstacle", 1, "vec3", "m", "obstacles", "p at the time of the state before"),
-    "obstacle_rotation_before": Field("obstacle", 1, "quat", "", "obstacles", "R"),
-    "obstacle_position_start": Field("obstacle", 1, "vec3", "m", "obstacles move", "p before the first step"),
-    "obstacle_rotation_start": Field("obstacle", 1, "quat", "", "obstacles move", "R"),
-    "obstacle_position_path": Field("obstacle step", 1, "vec3", "m", "obstacles move", "p after every step"),
-    "obstacle_rotation_path": Field("obstacle step", 1, "quat", "", "obstacles move", "R"),
-    "meshes": Field("obstacle", 1, "uint64", "", "obstacles", "Warp's mesh, or 0"),
-    "first_face": Field("obstacle", 1, "int", "", "obstacles", "of a mesh, among all faces"),
-    "face_obstacle": Field("face", 1, "int", "", "obstacles", "the mesh of a face"),
-    "mesh_corner": Field("face", 3, "vec3", "m", "obstacles", "three of each face, in the mesh's frame"),
-}
-"""What a scene says of contact. What it does not have is not in the arrays at all."""
-
-CRIMP: Group = {  # of crimp interchange, and of the contact force at crimped positions; others have none of it
-    "crimp_sides": Field("node", 1, "vec4i", "", "crimp interchange", "twice its part of each segment; < 0: straight"),
-    "crimp_around": Field("node", 1, "vec4i", "", "crimp interchange", "nodes left, right, up and down, where there"),
-    "crimp_corners": Field("node", 1, "vec4i", "", "crimp interchange", "corner_blocks of a crossing"),
-    "contact_offset": Field("yarn", 1, "scalar", "m", "crimped contact", "half the height of its crimp as woven"),
-}
 
 STAGES: Group = {
     "stage_size": Field("world", 1, "scalar", "s", "always", "η"),
@@ -353,12 +301,14 @@ LAUNCH: Group = {
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),
     "share": Field("launch", 1, "scalar", "", "always", "of a stage in what a step makes"),
     "step_duration": Field("launch", 1, "scalar", "s", "always", "h of a whole step"),
+    "is_last": Field("launch", 1, "int", "", "always", "whether what is in the way is a failure"),
     "moves": Field("launch", 1, "int", "", "always", "whether to look at where a step would lead"),
     "grid": Field("launch", 1, "uint64", "", "always", "Warp's hash grid"),
     "gaps": Field("launch", 1, "vec4", "1, m", "always", "(n, g) of what is near"),
     "contact_forces": Field("launch", 1, "vec3", "N", "always", "of what touches"),
     "source": Field("launch", 1, "any", "", "always", "array to copy"),
     "target": Field("launch", 1, "any", "", "always", "array to copy into"),
+    "origin": Field("launch", 1, "vec3", "m", "always", "where positions are counted from"),
     "array": Field("launch", 1, "any", "", "always", "array to clear"),
     "path": Field("launch", 1, "vec3", "", "always", "an input's rows, step after step"),
     "values": Field("launch", 1, "vec3", "", "always", "an input in this step"),

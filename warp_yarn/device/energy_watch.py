@@ -71,9 +71,13 @@ class EnergyWatch:
     def _add_energies(self, *, cheap: bool) -> None:
         """Adds up the energy of the terms that are watched at every step, or of the others."""
         for term in self.model.arrays.terms:
-            if term.energy is not None and bool(term.energy_watched_as) == cheap:
-                energy = self.model.arrays[term.energy_watched_as or "energy"]
-                self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
+            if term.energy is not None and bool(term.energy_watched_as) == cheap and term not in self._outer:
+                self.add(term, self.model.arrays[term.energy_watched_as or "energy"])
+
+    def add(self, term: Term, energy: wp.array) -> None:
+        """Adds a term's energy at the present state."""
+        arrays = self.model.contact.samples.of("position") if term.touches else {}
+        self.model.launch(f"{term.name}_energy", term.elements, energy=energy, **arrays)
 
     def begin_work(self) -> None:
         """Begins to add up the work done in a step."""
@@ -87,15 +91,19 @@ class EnergyWatch:
 
     @property
     def _outer(self) -> list[Term]:
-        """Finds the terms that do work on the cloth and have no energy."""
-        return [term for term in self.model.arrays.terms if term.works]
+        """Finds the terms that do work on the cloth and have no energy, gravity too where it varies."""
+        of_height = self.model.inputs.gravity_varies
+        terms = self.model.arrays.terms
+        return [term for term in terms if term.works or (of_height and term.energy_watched_as == "height_energy")]
 
     def _add_outer_forces(self, target: str) -> None:
         """Fills an array with outer forces at the present state."""
         a = self.model.arrays
         a.zero(target)
         for term in self._outer:
-            self.model.launch_term(term, matrix=0, add_contact_load=0, force=a[target])
+            # the weight of what slides goes where the solver works
+            others = {} if term.works else {"euler_force": a["q_s"]}
+            self.model.launch_term(term, matrix=0, add_contact_load=0, force=a[target], **others)
 
     def _add_powers(self) -> None:
         """Adds up the power of outer forces and of moving pins at the present state."""
@@ -108,6 +116,27 @@ class EnergyWatch:
         if "pins move" in a.conditions and any(term.name == "pins" for term in a.terms):
             self.model.launch("add_pin_power", "pins", step_duration=self.model.step_size)
         self.model.contact.add_power()
+
+    def power_of(self, name: str) -> float:
+        """Compute the power of a term that does work, at the present state along the solution, or of moving obstacles,
+        "contact" [W]."""
+        a = self.model.arrays
+        a.zero("power")
+        if name == "contact":
+            self.model.contact.find()
+            self.model.contact.add_power()
+            return float(a["power"].numpy()[0])
+        term = next(term for term in self._outer if term.name == name)
+        a.zero("q_x", "q_s")
+        self.model.launch_term(term, matrix=0, add_contact_load=0, force=a["q_x"], euler_force=a["q_s"])
+        pairs = [("q_x", "solution"), *([("q_s", "euler_solution")] if self.model.scene.sliding else [])]
+        return sum(float(np.vdot(*(a[name].numpy().astype(np.float64) for name in pair))) for pair in pairs)
+
+    @property
+    def workers(self) -> list[str]:
+        """Names what ``power_of`` knows."""
+        names = [term.name for term in self._outer]
+        return [*names, "contact"] if self.model.contact.obstacles_move else names
 
     def end_step(self, *, by_stages: bool) -> None:
         """Compares the energy at the end of a step with the work done in it."""

@@ -3,9 +3,11 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from ..description.scene import Scene
+from ..description.varying import has_gusts
 from ..kernels import Term, Variant, own
 
 
@@ -56,6 +58,9 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "seams": "seams" in names,
         "has gravity": scene.gravity is not None,
         "has wind": scene.wind is not None,
+        "gravity changes": isinstance(scene.gravity, np.ndarray) and scene.gravity.ndim == 2,
+        "wind changes": scene.wind is not None and np.ndim(scene.wind.velocity) == 2,
+        "gusts": has_gusts(scene.functions),
         "has pins": len(scene.pins) > 0,
         "hard pins": len(scene.pins) > 0 and scene.pin_stiffness is None,
         "spring pins": len(scene.pins) > 0 and scene.pin_stiffness is not None,
@@ -65,6 +70,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "obstacles": len(scene.obstacles) > 0 and scene.has_barrier,
         "obstacles move": scene.has_barrier and any(obstacle.path is not None for obstacle in scene.obstacles),
         "self-contact": scene.self_contact and scene.has_barrier,
+        "middles": (len(scene.obstacles) > 0 or scene.self_contact) and scene.contact.samples == "nodes+mids",
         "crimp interchange": "crimp_interchange" in names,
         "crimped contact": scene.contact_force == "crimped",
     }

@@ -12,10 +12,11 @@ import warp as wp
 
 from ..description.levels import BLOCKS
 from ..description.scene import Scene
-from ..errors import InputError, choice, integer, real
+from ..description.varying import has_gusts
+from ..errors import InputError, brief, choice, integer, real
 from ..kernels import TERMS, Term, Variant, build, own
 from ..kernels.core.general import NUMBERS
-from . import defaults
+from . import defaults, start
 from .arrays import Arrays
 from .contact import Contact
 from .declarations import INPUTS
@@ -30,7 +31,9 @@ MATRIX = (
     "diagonal_xx", "diagonal_xs", "diagonal_ss", "upper_xx", "upper_xs", "upper_sx", "upper_ss",
 )  # fmt: skip
 SUMS = ("force", "euler_force", "momentum", "euler_momentum")
-BETWEEN = (*SUMS, "friction_force_out", "normal", "contact_load")
+BETWEEN = (
+    *SUMS, "friction_force_out", "normal", "contact_load", "sample_position", "sample_velocity", "sample_force",
+)  # fmt: skip
 """Arrays that an assembly passes through, whose adjoints start at 0."""
 
 
@@ -39,7 +42,7 @@ class Model:
 
     Args:
         scene, step, device, precision, preconditioner, tolerance, newton_tolerance, max_iterations, threads,
-            differentiable: as of the Simulator.
+            differentiable: as of the Simulator; hooked: whether it has a hook.
 
     Attributes:
         arrays: by the names that kernels use.
@@ -65,24 +68,23 @@ class Model:
         max_iterations: int | None,
         threads: int,
         differentiable: bool,
+        hooked: bool = False,
     ):
         if not isinstance(scene, Scene):
-            raise InputError(f"scene = {scene!r}, must be a Scene")
+            raise InputError(f"scene = {brief(scene)}, must be a Scene")
         self.scene = scene
         self.step_size = real("step", step, above=0.0)
         self.precision = choice("precision", precision, PRECISIONS)
-        if preconditioner is None:
-            preconditioner = defaults.preconditioner(scene, self.step_size)
-        self.preconditioner = choice("preconditioner", preconditioner, PRECONDITIONERS)
+        chosen = defaults.preconditioner(scene, self.step_size) if preconditioner is None else preconditioner
+        self.preconditioner = choice("preconditioner", chosen, PRECONDITIONERS)
         exact = differentiable and precision == "double"
         if tolerance is None:
             tolerance = defaults.tolerance(precision, exact=exact)
         self.tolerance = real("tolerance", tolerance, above=0.0)
         given = defaults.EXACT if newton_tolerance is None and exact else newton_tolerance
         self._newton_tolerance = given if given is None else real("newton_tolerance", given, above=0.0)
-        if max_iterations is None:
-            max_iterations = defaults.max_iterations(scene)
-        self.max_iterations = integer("max_iterations", max_iterations, least=1)
+        most = defaults.max_iterations(scene) if max_iterations is None else max_iterations
+        self.max_iterations = integer("max_iterations", most, least=1)
         self.device = _checked_device(device)
         variant = Variant(PRECISIONS[precision], scene.sliding, differentiable, general=scene.cloth.general)
         self.kernels = _kernels(scene, variant)
@@ -90,7 +92,7 @@ class Model:
         _check_inputs(self)
         self.has_hard_pins = "hard pins" in self.arrays.conditions
         self.set_times(self.step_size, self.step_size, self.step_size)
-        self.inputs = Inputs(self)
+        self.inputs = Inputs(self, hooked=hooked)
         self.contact = Contact(self)
         self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)
@@ -127,7 +129,8 @@ class Model:
         self.arrays.launch(self.kernels[kernel], elements, **replaced)
 
     def launch_term(self, term: Term, **offered: Any) -> None:
-        """Launch a term, with what its kernel has arguments for."""
+        """Launch a term, with what its kernel has arguments for. Forces of contact are still to be scattered."""
+        offered |= self.contact.samples.offered(matrix=bool(offered.get("matrix"))) if term.touches else {}
         self.launch(term.name, term.elements, **self.arrays.taken(self.kernels[term.name], **offered))
 
     def copy(self, **targets: str) -> None:
@@ -157,27 +160,29 @@ class Model:
         a.zero(*SUMS)
         if matrix:
             a.zero(*MATRIX)
-        self._find_normals()
+        self._find_normals(matrix=matrix)
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
             self.launch_term(term, matrix=filled, add_contact_load=_presses(self, term), **arrays)
+            if term is self.contact.last:
+                self.contact.samples.scatter(matrix=matrix)
         self.launch("right_hand_side", "nodes", **replaced)
 
-    def _find_normals(self) -> None:
+    def _find_normals(self, *, matrix: bool = False) -> None:
         """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
         if self.arrays.contact:
             _find_crossings(self)
-        self.contact.find()
+        self.contact.find(matrix=matrix)
 
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
         a = self.arrays
         self._find_normals()
+        # the forces go where the solver works
+        unused = {"force": a["q_x"], "euler_force": a["q_s"]}
         for term in a.terms:
             if term.presses and _presses(self, term):
-                # the forces go where the solver works
-                unused = {"force": a["q_x"], "euler_force": a["q_s"]}
                 self.launch_term(term, matrix=0, add_contact_load=1, **unused)
 
     def set_pin_velocity(self, **replaced: Any) -> None:
@@ -190,7 +195,7 @@ class Model:
         self.launch("precondition", "nodes")
         if self.preconditioner == "incomplete":
             self.launch("factorize", 1)
-        if self.preconditioner == "multilevel":
+        elif self.preconditioner == "multilevel":
             _factorize_levels(self)
 
     def solve(self, **replaced: Any) -> None:
@@ -255,7 +260,7 @@ def _presses(model: Model, term: Term) -> int:
 def _checked_device(device: Any) -> Any:
     """Finds a device of Warp."""
     try:
-        return wp.get_device(device)
+        return start.device(device)
     except Exception as error:
         names = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"device = {device!r}, must be one of {names}") from error
@@ -265,7 +270,11 @@ def _kernels(scene: Scene, variant: Variant) -> dict[str, wp.Kernel]:
     """Builds the kernels of a scene's terms, of which one may have been registered when the scene was made."""
     for name in scene.terms:
         choice("scene.terms", name, TERMS)
-    return build(variant, scene.terms)
+    kernels = build(variant, scene.terms)
+    if has_gusts(scene.functions):
+        gusty = {name.removeprefix("gusty_"): name for name in kernels if name.startswith("gusty_")}
+        kernels = kernels | {name: kernels[other] for name, other in gusty.items()}
+    return kernels
 
 
 def _check_inputs(model: Model) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.util
 from typing import Any
 
-from ..errors import NoAttributeError
+from ..errors import NoAttributeError, missing_extra
 
 NAME = "warp_yarn/ThrowIntoBox-v0"
 
@@ -29,5 +29,5 @@ def __getattr__(name: str) -> Any:
         if error.name != "gymnasium":
             raise
         # what hasattr and getattr with a default take for an answer
-        raise NoAttributeError("environments need gymnasium: pip install warp_yarn[rl]") from error
+        raise NoAttributeError(str(missing_extra("gymnasium", "environments need", "rl"))) from error
     return ThrowIntoBox

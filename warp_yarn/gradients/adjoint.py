@@ -17,8 +17,12 @@ from ..device.contact import OBSTACLE_PATHS, PLACED
 from ..device.declared import arrays_of
 from ..device.inputs import PATHS
 from ..errors import GradientError, InputError
-from ..kernels.core.status import NOT_FINITE
+from ..kernels.core.status import CROWDED, NOT_FINITE
 from ..simulation.simulator import Simulator
+
+
+class Crowded(Exception):
+    """More is near each other than there is room for, at a state where the run made no list of it."""
 
 
 class Adjoint:
@@ -84,6 +88,7 @@ class Adjoint:
 
         Raises:
             GradientError: where an adjoint is not finite, or its solve does not converge.
+            Crowded: all of it is to be gone over again, with more room.
         """
         self.arrays.put("counters", steps, before + first + steps)
         with self.simulator.model.threads.at_hand():
@@ -119,7 +124,10 @@ class Adjoint:
     def _backward(self, method: Any, step: int) -> None:
         """Goes back over what ends at the present frame."""
         method.backward_step()
-        if self.arrays["status"].numpy()[0]:
+        code = int(self.arrays["status"].numpy()[0])
+        if code == CROWDED:
+            raise Crowded
+        if code:
             self._fail(method, step)
 
     def finish(self) -> None:

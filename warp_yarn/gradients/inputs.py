@@ -21,6 +21,8 @@ VECTORS = tuple(p.name for p in _OWN if p.size == 3)
 """Names of inputs that are no yarn's, beside those of registered terms."""
 ARRAY_OF_PATH = {"pin_path": "pin_target", "forces": "applied_force"}
 """Inputs that may change from step to step, and the arrays that hold a step's row of them."""
+ROWS = ("gravity", "wind_velocity")
+"""Others, which have the name of their arrays."""
 
 
 class Inputs:
@@ -68,6 +70,7 @@ class Inputs:
                 values[name] = path[:-1] if name == "forces" else path
             elif array in arrays:
                 values[name] = arrays[array].numpy()
+        values |= {name: arrays[f"{name}_path"].numpy() for name in ROWS if f"{name}_path" in arrays}
         values |= {name: arrays[name].numpy().reshape(shape) for name, shape in obstacle_shapes(simulator).items()}
         state = simulator.state
         values |= {name: getattr(state, name) for name in FIELDS}
@@ -153,7 +156,8 @@ def obstacle_shapes(simulator: Simulator) -> dict[str, tuple[int, ...]]:
 def array_of(name: str, value: torch.Tensor) -> str:
     """Names the array that holds an input: of one that changes from step to step, the rows of its path."""
     array = ARRAY_OF_PATH.get(name, name)
-    return f"{array}_path" if name in ARRAY_OF_PATH and value.ndim == 3 else array
+    has_rows = (name in ARRAY_OF_PATH and value.ndim == 3) or (name in ROWS and value.ndim == 2)
+    return f"{array}_path" if has_rows else array
 
 
 def allowed_range(name: str) -> dict[str, float]:

@@ -16,7 +16,7 @@ from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE, refuse_recording
 from ..simulation.simulator import Simulator
 from ..simulation.state import FIELDS, State
-from .adjoint import Adjoint
+from .adjoint import Adjoint, Crowded
 from .checkpoints import Checkpoints, flat
 from .inputs import ARRAY_OF_PATH, Inputs, array_of
 from .parts import PartsRecorder, SplitStep, pieces
@@ -114,6 +114,23 @@ class DeviceRun:
             Gradients of the wanted inputs.
         """
         refuse_recording(self.simulator.model.device)
+        while True:
+            try:
+                self._go_back(values, steps_done, kept, wanted, losses)
+            except Crowded:
+                self.simulator.stepper.make_room()
+            else:
+                return [self._gradient(name, values[name], losses) for name in wanted]
+
+    def _go_back(
+        self,
+        values: Mapping[str, torch.Tensor],
+        steps_done: int,
+        kept: Kept,
+        wanted: Sequence[str],
+        losses: Mapping[str, torch.Tensor | None],
+    ) -> None:
+        """Goes back over a run, and leaves gradients on the device."""
         self._upload(values, steps_done)
         adjoint = self._adjoint_of(wanted)
         adjoint.clear()
@@ -134,7 +151,6 @@ class DeviceRun:
                 adjoint.backward_part(part.method, part.size, part.left, first + 1, steps_done)
         self._set_losses(losses, -1, 1, move=1)
         adjoint.finish()
-        return [self._gradient(name, values[name], losses) for name in wanted]
 
     def _upload(self, values: Mapping[str, torch.Tensor], steps_done: int) -> None:
         """Puts inputs, and the scene's own values of the others, into the simulator, whatever the last run left."""

@@ -9,6 +9,7 @@ import warp as wp
 from ..device import declarations
 from ..device.graphs import GraphCache
 from ..device.model import BETWEEN, MATRIX, Model
+from .made import Made, Point, subtract_product
 
 
 class LinearlyImplicitEuler:
@@ -58,6 +59,19 @@ class LinearlyImplicitEuler:
         model.factorize()
         model.solve()
         model.launch("advance", "nodes")
+
+    def made(self, before: Point, after: Point, step: float) -> list[Made]:
+        """Finds the one solve of a step that was made from its two ends."""
+        return [Made(1.0, step, before.position, before.velocity, after.velocity, None, step)]
+
+    def assemble_made(self, stage: int) -> None:
+        """Assembles what is left of a solve that was made: b − A w, in place of the right-hand side."""
+        self.model.arrays.zero("evaluations")
+        self._assemble_stage(stage)
+        subtract_product(self.model)
+
+    def _assemble_stage(self, stage: int) -> None:
+        self.model.assemble()
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 

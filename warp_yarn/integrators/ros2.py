@@ -10,6 +10,7 @@ from ..device import declarations
 from ..device.model import BETWEEN, MATRIX, Model
 from ..kernels.stepping.ros2 import GAMMA
 from .linear import LinearlyImplicitEuler
+from .made import Made, Point, held
 
 
 class ROS2(LinearlyImplicitEuler):
@@ -83,6 +84,29 @@ class ROS2(LinearlyImplicitEuler):
         model.assemble(explicit=self._explicit, mass=mass, step_size=a["stage_size"])
         if a["anchor"] is not None:
             model.launch("second_stage_damping", "crossings")
+
+    def made(self, before: Point, after: Point, step: float) -> list[Made]:
+        """Finds both solves of a step that was made from its two ends, as the adjoint does. By 2γ² − 4γ + 1 = 0 the
+        impulse of the step is the mean of theirs, each over η, times h."""
+        size, v = GAMMA * step, before.velocity
+        mean = (after.position - before.position) / step
+        both = (after.velocity - mean) * (2.0 * GAMMA / (1.0 - GAMMA))
+        fixed = held(self.model)
+        both[fixed] = 0.0
+        first = mean - 0.5 * both
+        first[fixed] = after.velocity[fixed]
+        second = v + (first - v) / GAMMA
+        increment = second - 4.0 * first + 2.0 * v
+        return [
+            Made(0.5, size, before.position, v, first, None, size),
+            Made(0.5, size, before.position + step * first, second, both - first, increment, size, first),
+        ]
+
+    def _assemble_stage(self, stage: int) -> None:
+        if stage == 0:
+            self._assemble_first()
+        else:
+            self._assemble_second()
 
     # -- adjoint -----------------------------------------------------------------------------------------------------
 

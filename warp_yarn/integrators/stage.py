@@ -7,6 +7,7 @@ from collections.abc import Callable
 from ..device import declarations
 from ..device.graphs import GraphCache
 from ..device.model import Model
+from .made import Made, Point, held
 from .newton import Newton
 from .stage_adjoint import StageAdjoint
 
@@ -116,6 +117,28 @@ class StageMethod:
             base_velocity="velocity",
             base_euler_velocity="euler_velocity",
         )
+
+    def made(self, before: Point, after: Point, step: float) -> list[Made]:
+        """Finds the stages of a step that was made from its two ends, as the adjoint does."""
+        stage, carried = self.fraction * step, self.carried * step
+        rate = self.carried / self.fraction
+        if self.is_carried:
+            return [Made.implicit(1.0, stage, before, before.velocity + (after.velocity - before.velocity) / rate)]
+        if self.stages == 1:
+            return [Made.implicit(1.0, stage, before, after.velocity)]
+        first = (after.position - before.position - stage * after.velocity) / carried
+        # what is held has one velocity in both
+        fixed = held(self.model)
+        first[fixed] = after.velocity[fixed]
+        base = Point(before.position + carried * first, before.velocity + rate * (first - before.velocity))
+        return [
+            Made.implicit(self._shares[0], stage, before, first),
+            Made.implicit(self._shares[1], stage, base, after.velocity),
+        ]
+
+    def assemble_made(self, stage: int) -> None:
+        """Assembles the right-hand side of a stage that was made, in place: what is left of it is the residual."""
+        self.newton.assemble(matrix=False)
 
     def forget_graphs(self) -> None:
         """Captures anew, after arrays have changed their place."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..description.draft import Draft
 from ..description.weave import Weave
-from ..errors import InputError
+from ..errors import InputError, missing_extra
 from .draft_wif import Reading, Sections, sections_of, text_of
 from .files import atomic_write
 
@@ -103,7 +103,7 @@ def _foreign(data: bytes, ending: str, name: str) -> Sections:
     try:
         import dtx_to_wif
     except ImportError as error:
-        raise InputError(f"to read {ending} takes dtx-to-wif: pip install warp_yarn[drafts]") from error
+        raise missing_extra("dtx-to-wif", f"files of {ending} need", "drafts") from error
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about defaults, of which Reading has its own

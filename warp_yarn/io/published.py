@@ -21,7 +21,7 @@ import numpy as np
 from ..description.cloth import Cloth, Yarn
 from ..description.scene import Scene, Wind
 from ..description.weave import WEAVES
-from ..errors import InputError, finite_array
+from ..errors import InputError, finite_array, missing_extra
 from ..presets import paper
 from ..simulation.state import FIELDS, Trajectory
 
@@ -75,7 +75,7 @@ def _rms(offset: np.ndarray) -> float:
 
 
 def read_published(path: str | os.PathLike) -> Published:
-    """Reads a file of the paper's published data. Needs warp_yarn[data].
+    """Reads a file of the paper's published data. Needs the extra ``data``.
 
     Raises:
         InputError: h5py is not installed, or the file is missing, open in another program, not HDF5, damaged, or not of
@@ -84,7 +84,7 @@ def read_published(path: str | os.PathLike) -> Published:
     try:
         import h5py
     except ImportError as error:
-        raise InputError("to read published data takes h5py: pip install warp_yarn[data]") from error
+        raise missing_extra("h5py", "published data need", "data") from error
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")

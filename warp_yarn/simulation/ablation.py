@@ -209,16 +209,21 @@ def _without(scene: Scene, names: set[str]) -> Scene:
 
 
 def _halved(scene: Scene, start: State | None) -> Scene:
-    """Makes the scene for half the step: pins and obstacles go evenly to where they are at a step's end, and forces
-    stay for two."""
+    """Makes the scene for half the step: pins and obstacles go evenly to where they are at a step's end, and forces,
+    gravity and wind stay for two."""
     path = scene.pin_path
     if path is not None:
         first = (scene.cloth if start is None else start).position[scene.pins]
         before = np.concatenate([first[None], path[:-1]])
         path = np.stack([0.5 * (before + path), path], axis=1).reshape(-1, *path.shape[1:])
-    forces = {node: np.repeat(f, 2, axis=0) if f.ndim == 2 else f for node, f in scene.forces.items()}
+
+    def twice(rows: Any) -> Any:
+        return np.repeat(rows, 2, axis=0) if np.ndim(rows) == 2 else rows
+
+    forces = {node: twice(force) for node, force in scene.forces.items()}
+    wind = None if scene.wind is None else scene.wind.replace(velocity=twice(scene.wind.velocity))
     obstacles = [o if o.path is None else o.replace(path=_halved_poses(o, o.path)) for o in scene.obstacles]
-    return scene.replace(pin_path=path, forces=forces, obstacles=obstacles)
+    return scene.replace(pin_path=path, forces=forces, obstacles=obstacles, gravity=twice(scene.gravity), wind=wind)
 
 
 def _halved_poses(obstacle: Obstacle, path: np.ndarray) -> np.ndarray:

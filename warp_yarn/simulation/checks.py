@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..description.scene import Scene
-from ..errors import InputError, integer, real
+from ..errors import InputError, brief, integer, real
 from ..integrators import INTEGRATORS
 from ..integrators.linear import LinearlyImplicitEuler
 from ..integrators.stage import StageMethod
 from .state import State
 
-CHUNK_BYTES = 1 << 24
+CHUNK_BYTES = 1 << 22
 """Room for frames on the device: enough that copying them out costs nothing, little enough for a large cloth."""
 
 FRAME_BYTES = 13 * 8
@@ -34,7 +34,7 @@ def checked_state(state: Any, scene: Scene) -> State:
             nothing does.
     """
     if not isinstance(state, State):
-        raise InputError(f"state = {state!r}, must be a State")
+        raise InputError(f"state = {brief(state)}, must be a State")
     state = state.checked(scene.cloth.nodes)
     topology = scene.cloth.topology
     direction = topology.yarn_direction[topology.segment_yarn]
@@ -82,8 +82,13 @@ def check_contact(scene: Scene, integrator: str) -> None:
         )
 
 
-def checked_chunk(chunk: int | None, nodes: int) -> int:
-    """Gives the steps to a chunk: kernels count its nodes in 31 bits, and its frames have to be in memory."""
+def checked_chunk(chunk: int | None, nodes: int, *, one: bool = False) -> int:
+    """Gives the steps to a chunk: kernels count its nodes in 31 bits, and its frames have to be in memory. It is one
+    where something is to be done before each step."""
+    if one and chunk not in (None, 1):
+        raise InputError(f"chunk = {chunk!r}, must be 1 or None with a hook or functions, which come before each step")
+    if one:
+        return 1
     if chunk is None:
         return min(64, max(1, CHUNK_BYTES // (FRAME_BYTES * nodes)))
     most = LARGEST // (2 * nodes) - 1

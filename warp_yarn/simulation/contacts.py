@@ -12,17 +12,18 @@ from ..device.contact import Near
 
 @dataclasses.dataclass(eq=False, frozen=True)
 class Contacts:
-    """Where nodes touch obstacles and each other: NumPy, a row for each pair.
+    """Where samples touch obstacles and each other: NumPy, a row for each pair.
 
     Args:
-        node: which [contacts].
-        other: the other node [contacts], or -1.
+        node: which [contacts], or the first of the segment whose middle it is that touches.
+        other: the other node [contacts], or the first of its segment, or -1 of an obstacle.
         obstacle: the obstacle, by its place in ``scene.obstacles`` [contacts], or -1.
-        gap: distance of the node from it [contacts] (m).
-        normal: towards the node [contacts, 3].
-        load: force along the normal on the node [contacts] (N), above 0.
-        tangential: friction on the node [contacts, 3] (N).
-        place: of the obstacle's surface, closest to the node, or halfway between two nodes [contacts, 3] (m).
+        gap: distance from it [contacts] (m).
+        normal: towards the sample [contacts, 3].
+        load: force along the normal on the sample [contacts] (N), above 0.
+        tangential: friction on the sample [contacts, 3] (N).
+        place: of the obstacle's surface, closest to the sample, or halfway between two samples [contacts, 3] (m).
+        node_end, other_end: the second node of the segment whose middle touches, or -1 where a node does [contacts].
     """
 
     node: np.ndarray
@@ -33,19 +34,30 @@ class Contacts:
     load: np.ndarray
     tangential: np.ndarray
     place: np.ndarray
+    node_end: np.ndarray
+    other_end: np.ndarray
 
     def __len__(self) -> int:
         return len(self.node)
 
 
-def contacts_of(found: Sequence[Near], position: np.ndarray) -> Contacts:
-    """Picks what touches of what is near."""
+def contacts_of(found: Sequence[Near], places: np.ndarray, ends: np.ndarray) -> Contacts:
+    """Picks what touches of what is near.
+
+    Args:
+        found: what is near.
+        places: of samples [samples, 3] (m).
+        ends: their nodes [samples, 2].
+    """
     none = np.zeros(0, dtype=np.int64)
     nothing = Near(none, none, none, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
     joined = Near(*(np.concatenate(parts) for parts in zip(nothing, *found, strict=True)))
     touch = joined.force.any(axis=1)
-    node, other, obstacle, gap, normal, force = (values[touch] for values in joined)
+    sample, other, obstacle, gap, normal, force = (values[touch] for values in joined)
     load = np.einsum("ij,ij->i", force, normal)
     part = np.where(other >= 0, 0.5, 1.0)
-    place = position[node] - (part * gap)[:, None] * normal
-    return Contacts(node, other, obstacle, gap, normal, load, force - load[:, None] * normal, place)
+    place = places[sample] - (part * gap)[:, None] * normal
+    node, node_end = ends[sample].T
+    others, other_end = np.where(other >= 0, ends[other].T, -1)
+    friction = force - load[:, None] * normal
+    return Contacts(node, others, obstacle, gap, normal, load, friction, place, node_end, other_end)

@@ -25,6 +25,9 @@ class Failure:
     def __init__(self, model: Model):
         arrays, self.model = model.arrays, model
         self.code, self.node = (int(value) for value in arrays["status"].numpy()[:2])
+        if self.node >= 0:
+            # contact knows nodes and middles of segments
+            self.node = int(model.contact.samples.ends[self.node, 0])
         self.residual = float(arrays["residual"].numpy()[0])
         self.iterations = int(arrays["iterations"].numpy()[0])
         arrays.put("status", 0, 0, 0)

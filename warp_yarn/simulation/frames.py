@@ -13,7 +13,8 @@ from ..device.exclusive import ALONE
 from ..device.model import Model
 from ..errors import InputError
 from .checks import FRAME_BYTES
-from .state import FIELDS, State, Trajectory
+from .pace import Pace
+from .state import FIELDS, End, State, Trajectory
 
 
 @dataclasses.dataclass
@@ -22,19 +23,21 @@ class Recording:
 
     Args:
         first: steps done at frame 0.
-        filled: frames that are there.
+        pace: when its frames are.
+        kept: frames that are there, and steps made until then.
         open: whether the state is still what the last of them led to.
     """
 
     trajectory: Trajectory
     first: int
-    filled: int = 1
+    pace: Pace
+    kept: tuple[int, int] = (1, 0)
     open: bool = True
 
     @property
     def last(self) -> int:
-        """Steps done at its last frame."""
-        return self.first + self.filled - 1
+        """Steps done until where it is kept."""
+        return self.first + self.kept[1]
 
 
 class Frames:
@@ -46,12 +49,18 @@ class Frames:
 
     Attributes:
         recording: the run that is kept; None: there is none.
+        options: of the simulator, which trajectories tell.
     """
 
     def __init__(self, model: Model, chunk: int):
         self.model, self.arrays, self.scene, self.chunk = model, model.arrays, model.scene, chunk
         self.arrays.add_frames(chunk + 1)
         self.recording: Recording | None = None
+        self.options: dict[str, Any] | None = None
+        self.filled = 0
+        """Steps of the chunk on the device that lead to the present state."""
+        self.inputs_changed = False
+        """Whether the last step was made with other inputs than those that are in place."""
 
     def moves(self, name: str) -> bool:
         """Tells whether this part of the state changes in the scene."""
@@ -105,42 +114,81 @@ class Frames:
 
     def room(self, frames: int, start: int) -> Trajectory:
         """Makes a trajectory that holds the present state in its first frame, and in all of what does not change."""
-        present, values = self.state(), {}
+        present = self.state()
+        values: dict[str, Any] = {}
         for name in FIELDS:
             first = getattr(present, name)
             values[name] = np.empty((frames, *first.shape))
             values[name][: 1 if self.moves(name) else frames] = first
-        return Trajectory(self.scene.cloth, self.model.step_size, **values, scene=self.scene, start=start)
+        values |= {"scene": self.scene, "start": start, "options": self.options}
+        return Trajectory(self.scene.cloth, self.model.step_size, **values)
+
+    def last_step(self) -> list[State] | None:
+        """Copies the states before and after the last step; None where none led to the present state."""
+        if not self.filled or self.inputs_changed:
+            return None
+        ends = [self.state(), self.state()]
+        for name in FIELDS:
+            if self.moves(name):
+                kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                origin = self.arrays.origin if name == "position" else 0.0
+                setattr(ends[0], name, kept[self.filled - 1].astype(np.float64) + origin)
+        return ends
 
     # -- a run that is kept ------------------------------------------------------------------------------------------
 
-    def record(self, steps: int, start: int) -> Trajectory:
-        """Begins to keep a run of so many steps, after ``start`` others; an InputError where memory has no room."""
+    def record(self, pace: Pace, start: int) -> Trajectory:
+        """Begins to keep the frames of a run, after ``start`` steps; an InputError where memory has no room."""
         try:
-            trajectory = self.room(steps + 1, start)
+            trajectory = self.room(pace.frames, start)
         except (MemoryError, ValueError) as error:
-            size = (steps + 1) * FRAME_BYTES * self.scene.cloth.nodes / 2**30
-            raise InputError(f"steps = {steps}, whose frames take {size:.3g} GiB, more than there is") from error
-        self.recording = Recording(trajectory, start)
+            size = pace.frames * FRAME_BYTES * self.scene.cloth.nodes / 2**30
+            raise InputError(f"steps = {pace.steps}, whose frames take {size:.3g} GiB, more than there is") from error
+        trajectory.step, trajectory.every = pace.every * self.model.step_size, pace.every
+        self.recording = Recording(trajectory, start, pace)
         return trajectory
 
     def keep(self, start: int, made: int) -> None:
         """Keeps the frames of a chunk that began after so many steps, if a run asks for them."""
+        self.filled, self.inputs_changed = made, False
         recording = self.recording
-        if recording is not None and recording.open and start == recording.last:
-            at = start - recording.first
-            if at + made < len(recording.trajectory):
-                self.copy(recording.trajectory, at, made + 1)
-                recording.filled = at + made + 1
+        if recording is None or not recording.open or start != recording.last:
+            return
+        filled, at = recording.kept
+        if at + made <= recording.pace.steps:
+            if recording.pace.every == 1:
+                upto = min(at + made + 1, len(recording.trajectory))
+                self.copy(recording.trajectory, at, upto - at)
+            else:
+                upto = recording.pace.count(at + made)
+                self._copy_between(recording.trajectory, filled, recording.pace.places(filled, upto) - at)
+            recording.kept = (upto, at + made)
+
+    def _copy_between(self, trajectory: Trajectory, at: int, places: np.ndarray) -> None:
+        """Copies frames to where they belong that are after so many steps of the chunk, which need not be whole."""
+        before = places.astype(int)
+        after, share = np.ceil(places).astype(int), (places - before)[:, None, None]
+        for name in FIELDS:
+            if self.moves(name) and len(places):
+                made = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                origin = self.arrays.origin if name == "position" else 0.0
+                # what stands still does so to the last bit
+                kept = made[before] + share * (made[after] - made[before])
+                getattr(trajectory, name)[at : at + len(places)] = kept + origin
 
     def close(self) -> None:
         """Says that the state is another now than what the frames led to."""
+        self.filled = 0
         if self.recording is not None:
             self.recording.open = False
 
-    def recorded(self, steps_done: int) -> Trajectory | None:
-        """Gives the frames that are kept, if the state after so many steps is the last of them."""
+    def recorded(self, steps_done: int, next_size: float) -> Trajectory | None:
+        """Gives the frames that are kept, if the state after so many steps is what they led to."""
         recording = self.recording
         if recording is None or not recording.open or recording.last != steps_done:
             return None
-        return recording.trajectory.cut(recording.filled)
+        filled, steps = recording.kept
+        frames = recording.trajectory.cut(filled)
+        if filled and recording.pace.places(filled - 1, filled)[0] != steps:
+            frames.end = End(self.state(), steps_done, next_size)
+        return frames

@@ -18,6 +18,9 @@ from .linear_system import LinearSystem, read_system
 from .state import FIELDS, State
 from .stepper import Stepper
 
+GIVEN = ("gravity", "wind_velocity", "gust", "applied_force", "applied_force_path")
+"""Arrays that functions are evaluated into."""
+
 
 class Inspection:
     """Looks into the present state or another one, and leaves no trace. The base of the simulator, which has these:
@@ -41,7 +44,7 @@ class Inspection:
         """
         a, cloth, result = self.model.arrays, self.model.scene.cloth, {}
         crossing = np.repeat(cloth.topology.is_crossing != 0, 2)
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             total = np.zeros(2 * cloth.nodes)
             for term in a.terms:
@@ -50,7 +53,10 @@ class Inspection:
                 a.zero("force", "euler_force", "friction_force_out")
                 if term.reads_forces:
                     a["euler_force"].assign(total)
+                self.model.contact.samples.clear(matrix=False)
                 self.model.launch_term(term, matrix=0, add_contact_load=0)
+                if term.touches:
+                    self.model.contact.samples.scatter(matrix=False)
                 out = "friction_force_out" if term.name == "friction" else "euler_force"
                 along = np.zeros(2 * cloth.nodes)
                 if a[out] is not None:
@@ -71,7 +77,7 @@ class Inspection:
         a = self.model.arrays
         if not a.contact:
             raise InputError("this scene has no contact: neither 'shear' nor 'friction' is among its terms")
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             load = a["contact_load"].numpy().astype(np.float64)
             return a["normal"].numpy().astype(np.float64), np.maximum(load, 0.0)
@@ -86,23 +92,15 @@ class Inspection:
         if self.model.zones is not None:
             raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
         contact, found = self.model.contact, []
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             position = self.model.arrays["position"].numpy() + self.model.arrays.origin
             if contact.obstacles:
                 found.append(contact.near_obstacles())
             if contact.has_mesh:
-                found.append(self._with_room(contact.near_faces))
+                found.append(contact.near_faces())
             if contact.self_contact:
-                found.append(self._with_room(contact.near_pairs))
-        return contacts_of(found, position)
-
-    def _with_room(self, report: Callable[[], Near]) -> Near:
-        """Reports what is near, with room for all of it."""
-        found = report()
-        while int(self.model.arrays["status"].numpy()[0]) == CROWDED:
-            self.stepper.make_room()
-            found = report()
-        return found
+                found.append(contact.near_pairs())
+        return contacts_of(found, contact.samples.places(position), contact.samples.ends)
 
     @alone
     def check_clear(self, state: State | None = None) -> None:
@@ -116,14 +114,14 @@ class Inspection:
         contact = self.model.contact
         if not contact.on:
             return
-        with _Visit(self.stepper, state):
-            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
+        with Visit(self.stepper, state):
+            found = [contact.near_pairs()] if contact.self_contact else []
             # of a state that is set, the time is not known yet by which obstacles move
             where_known = state is None or not contact.obstacles_move
             if where_known and contact.obstacles:
                 found.append(contact.near_obstacles())
             if where_known and contact.has_mesh:
-                found.append(self._with_room(contact.near_faces))
+                found.append(contact.near_faces())
         for near in found:
             if len(near.gap):
                 gap, least, words = self._nearest(near)
@@ -135,13 +133,15 @@ class Inspection:
         """Tells what is nearest to a node of the present state, with obstacles where the next step
         has them; or ""."""
         contact = self.model.contact
-        with _Visit(self.stepper, None, ahead=True):
-            found = [self._with_room(contact.near_pairs)] if contact.self_contact else []
+        with Visit(self.stepper, None, ahead=True):
+            found = [contact.near_pairs()] if contact.self_contact else []
             found += [contact.near_obstacles()] if contact.obstacles else []
-            found += [self._with_room(contact.near_faces)] if contact.has_mesh else []
+            found += [contact.near_faces()] if contact.has_mesh else []
         told = []
         for near in found:
-            mine = (near.node == node) | (near.other == node)
+            ends = contact.samples.ends
+            its = (near.other >= 0) & (ends[near.other] == node).any(axis=1)
+            mine = (ends[near.sample] == node).any(axis=1) | its
             if mine.any():
                 gap, least, words = self._nearest(Near(*(values[mine] for values in near)))
                 told.append((gap - least, words))
@@ -149,16 +149,16 @@ class Inspection:
 
     def _nearest(self, near: Near) -> tuple[float, float, str]:
         """Finds the two that are nearest: how near, how near they may be, and that in words."""
-        place = self.model.scene.cloth.place
+        name_of = self.model.contact.samples.name
         k = int(near.gap.argmin())
-        node, other, obstacle = int(near.node[k]), int(near.other[k]), int(near.obstacle[k])
+        sample, other, obstacle = int(near.sample[k]), int(near.other[k]), int(near.obstacle[k])
         of_pair = other >= 0
         name = "self_contact_distance" if of_pair else "contact_distance"
         least = float(self.model.arrays[name].numpy()[0])
         kind = "" if of_pair else type(self.model.scene.obstacles[obstacle]).__name__
-        it = f"node {other} ({place(other)})" if of_pair else f"obstacles[{obstacle}], a {kind}"
+        it = name_of(other) if of_pair else f"obstacles[{obstacle}], a {kind}"
         words = (
-            f"node {node} ({place(node)}) is {near.gap[k]:.3g} m from {it}: must be above the contact's "
+            f"{name_of(sample)} is {near.gap[k]:.3g} m from {it}: must be above the contact's "
             f"{'self_distance' if of_pair else 'distance'}, {least:.3g} m"
         )
         return float(near.gap[k]), least, words
@@ -167,13 +167,13 @@ class Inspection:
     def energy(self, state: State | None = None) -> dict[str, float]:
         """Computes the energy of every term that has one [J], by name; ``mass`` is the kinetic energy."""
         a, result = self.model.arrays, {}
-        with _Visit(self.stepper, state):
+        with Visit(self.stepper, state):
             self.model.add_contact_load()
             energy = a.zeros(1, a.variant.scalar)
             for term in a.terms:
                 if term.energy is not None:
                     energy.zero_()
-                    self.model.launch(f"{term.name}_energy", term.elements, energy=energy)
+                    self.model.energy.add(term, energy)
                     # what touches is told as one
                     name = "contact" if term.touches else term.name
                     result[name] = result.get(name, 0.0) + float(energy.numpy()[0])
@@ -188,29 +188,56 @@ class Inspection:
             weights: factors of M, D and H in its matrix; None: 1, h and h².
         """
         h = self.model.step_size
-        with _Visit(self.stepper, state, ahead=True):
+        with Visit(self.stepper, state, ahead=True):
             self.model.arrays.zero("evaluations")
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
-            self.model.assemble()
+            with_room(self.stepper, self.model.assemble)
             return read_system(self.model)
 
 
-class _Visit:
+def with_room(stepper: Stepper, look: Callable[[], None]) -> bool:
+    """Does what looks for what touches at the present positions, which no step may have come to, and makes room until
+    there is enough for it; tells whether it had to."""
+    look()
+    made = False
+    while int(stepper.model.arrays["status"].numpy()[0]) == CROWDED:
+        stepper.make_room()
+        look()
+        made = True
+    return made
+
+
+class Visit:
     """Another state for as long as a block lasts; the arrays that a step works with are free for it.
 
-    Pins and applied forces are those of the last step, or, if asked for, of the next one.
+    Pins and applied forces are those of the last step, or, if asked for, of the next one, or of the step after so many
+    (``row``), whose stages are then at their times. Functions are evaluated where the cloth is, or where that step
+    began.
     """
 
-    def __init__(self, stepper: Stepper, state: State | None, *, ahead: bool = False):
+    def __init__(
+        self,
+        stepper: Stepper,
+        state: State | None,
+        *,
+        ahead: bool = False,
+        row: int | None = None,
+        begun: np.ndarray | None = None,
+    ):
         self.stepper = stepper
-        self.ahead = ahead
-        self.row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.ahead, self.by_stages = ahead, row is not None
+        if row is None:
+            row = stepper.steps_done if ahead else max(0, stepper.steps_done - 1)
+        self.row, self.begun = row, begun
         self.visited = None if state is None else checked_state(state, stepper.model.scene)
 
     def __enter__(self) -> None:
         stepper, model, home = self.stepper, self.stepper.model, {}
         if self.visited is not None:
             home = {name: model.arrays[name].numpy().copy() for name in FIELDS if stepper.frames.moves(name)}
+        if model.inputs.functions:
+            given = [name for name in GIVEN if model.arrays.get(name) is not None]
+            home |= {name: model.arrays[name].numpy().copy() for name in given}
 
         def go_home() -> None:
             for name, value in home.items():
@@ -219,11 +246,16 @@ class _Visit:
 
         stepper.owe(go_home)
         model.arrays.put("counters", 0, self.row)
-        # before the first step, pins are where they start
-        model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
-        model.inputs.load()
+        if model.inputs.functions:
+            begun = self.visited.position if self.begun is None and self.visited is not None else self.begun
+            model.inputs.evaluate(self.row, stepper.frames.state().position if begun is None else begun)
+        if not self.by_stages:
+            # before the first step, pins are where they start
+            model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
+            model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)
+        with_room(stepper, model.contact.find)
 
     def __exit__(self, *_: object) -> None:
         self.stepper.pay()

@@ -1,6 +1,7 @@
 """The linear system of a step as arrays of NumPy, to look into and to compare solvers with."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -63,11 +64,16 @@ def read_system(model: Model) -> LinearSystem:
         add(mine, x[other], values["upper_sx"].reshape(nodes, 4, 3)[node, slot][:, None, :])
         add(mine, its, values["upper_ss"].reshape(nodes, 4)[node, slot][:, None, None])
     if model.contact.self_contact:
-        node, slot = np.nonzero(np.arange(a["near_room"]) < a["near_count"].numpy()[:, None])
-        place = node * a["near_room"] + slot
+        sample, slot = np.nonzero(np.arange(a["touch_room"]) < a["touch_count"].numpy()[:, None])
+        place = sample * a["touch_room"] + slot
         # both lists of a pair have its block
-        block = a["near_block"].numpy()[place][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        add(x[node], x[a["near"].numpy()[place]], -block, mirror=False)
+        block = a["touch_block"].numpy()[place][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        mine, its = model.contact.samples.ends[sample], model.contact.samples.ends[a["touch"].numpy()[place]]
+        for i, j in itertools.product(range(2), range(2)):
+            # of a node alone all, of a middle half of it for either end
+            there = (mine[:, i] >= 0) & (its[:, j] >= 0)
+            share = np.where(mine[:, 1] < 0, 1.0, 0.5) * np.where(its[:, 1] < 0, 1.0, 0.5)
+            add(x[mine[there, i]], x[its[there, j]], -(share[:, None, None] * block)[there], mirror=False)
     topology = model.scene.cloth.topology
     free = [np.repeat(a["is_free"].numpy() != 0, 3)]
     rhs = [values["rhs"].ravel()]

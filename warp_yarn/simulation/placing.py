@@ -46,6 +46,7 @@ class Placing(Inspection):
         try:
             put(places)
             self.check_clear()
+            self.stepper.frames.inputs_changed = True
         except BaseException:
             put(before)
             raise

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import tqdm
 
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..device.model import Model
-from ..errors import choice, integer
+from ..errors import InputError, choice, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
 from .alone import alone
 from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
 from .diagnosis import Failure
+from .film import DECIDING, Filming, bar
 from .frames import Frames
-from .placing import Placing
+from .loads import Loads
+from .pace import Pace, every_of
 from .state import State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
 
 BESIDE_TERMS = (
     *("spacing", "radius", "pin_target", "pin_target_path", "applied_force", "applied_force_path"),
+    *("gravity_path", "wind_velocity_path"),
     *("obstacle_position", "obstacle_rotation"),
 )
 """Arrays that hold what a scene says beside the parameters of terms; the simulator's owner may change both."""
@@ -42,7 +43,7 @@ def _of_stepper(name: str) -> Any:
     )
 
 
-class Simulator(Placing):
+class Simulator(Loads, Filming):
     """Simulates a scene.
 
     Threads may share one, and simulators may run in several threads: each call is as if it were alone. After an
@@ -80,15 +81,15 @@ class Simulator(Placing):
             stages tell its error. None: steps are made at once.
         energy_watch: whether a step that gains energy from nowhere is made again, and ends the run where that does not
             help (``docs/solver.md``). False is for who wants a method as it is, such as the paper's eq. 2.
-        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64.
+        chunk: steps whose frames the device keeps at a time; None: as many as take 16 MB, at most 64; 1 with a hook.
         differentiable: whether to compile reverse mode too, for gradients; ``warp_yarn.torch`` asks for it.
+        hook: called with the simulator before each step, in whatever way it is run; it may read all and ``set_inputs``.
 
     Attributes:
         state: the present state, as a copy; set it to start from another one. ``steps_done`` stays as it is then.
         steps_done: steps since the beginning, by which moving pins and applied forces are looked up; set it where a
             state is one that was saved after so many steps.
-        trajectory: the frames of the last run, where an exception ended it, as long as the state is the last of them;
-            else None.
+        trajectory: the frames of the last run where an exception ended it and the state is the last of them, or None.
         split_steps: which of the steps since the beginning could not be made at once by the method, and their smallest
             part [s].
         damped_steps: those of them that gained energy, so that a method which damps made them, or parts of them.
@@ -113,23 +114,24 @@ class Simulator(Placing):
         energy_watch: bool = True,
         chunk: int | None = None,
         differentiable: bool = False,
+        hook: Callable[[Simulator], None] | None = None,
     ):
         self._options = {
             "step": step, "integrator": integrator, "device": device, "precision": precision, "threads": threads,
             "preconditioner": preconditioner, "tolerance": tolerance, "newton_tolerance": newton_tolerance,
             "max_iterations": max_iterations, "step_error": step_error, "energy_watch": energy_watch, "chunk": chunk,
-            "differentiable": differentiable,
+            "differentiable": differentiable, "hook": hook,
         }  # fmt: skip
         self.lock = threading.RLock()
         """Held while one thread uses the simulator; before ``exclusive.ALONE`` where both are."""
         with ALONE, compiling():
-            self.stepper = _made(scene, **self._options)
+            self.stepper = _made(self, scene, **self._options)
             self.scene, self.model, self.integrator = scene, self.stepper.model, self.stepper.integrator
             self.arrays, self.substepping = self.model.arrays, self.stepper.substepping
-            self.step_size = self.model.step_size
-            self.chunk = self.stepper.frames.chunk
+            self.chunk, self.step_size = self.stepper.frames.chunk, self.model.step_size
             self.step_error = None if step_error is None else float(step_error)
             self._options["device"] = str(self.model.device)
+            self.stepper.frames.options = {name: self._options[name] for name in DECIDING}
         self.check_clear()
         warn_of_threads(threads)
 
@@ -176,32 +178,15 @@ class Simulator(Placing):
     split_steps = _of_stepper("split_steps")
     damped_steps = _of_stepper("damped_steps")
 
-    @property
-    @alone
-    def trajectory(self) -> Trajectory | None:
-        """The frames of the last run where an exception ended it, the one that it started from first; None where none
-        did, or where the state is no longer the last of them."""
-        return self.stepper.frames.recorded(self.stepper.steps_done)
-
     def run_chunk(self, steps: int) -> int:
         """Makes at most ``chunk`` steps, into the frames on the device; the state is frame 0.
 
         Returns:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
+        integer("steps", steps, least=0, most=self.chunk)
         with self.lock:
             return self.stepper.make_chunk(steps)
-
-    @alone
-    def chunk_trajectory(self, frames: int) -> Trajectory:
-        """Copies the first frames of the chunk that the device holds."""
-        trajectory = self.stepper.frames.room(frames, self.stepper.steps_done - frames + 1)
-        self.stepper.frames.copy(trajectory, 0, frames)
-        return trajectory
-
-    def moves(self, name: str) -> bool:
-        """Tells whether this part of the state changes in this scene."""
-        return self.stepper.frames.moves(name)
 
     @alone
     def fail(self, k: int, trajectory: Trajectory) -> None:
@@ -211,40 +196,48 @@ class Simulator(Placing):
             forces, near = self.forces(), self.told_nearest(failure.node)
         raise failure.error(k, trajectory, forces, self.substepping, self.step_error, near)
 
-    def run(self, steps: int, *, progress: bool | None = False) -> Trajectory:
-        """Makes steps and returns every frame, the present one first.
+    def run(
+        self,
+        steps: int | None = None,
+        *,
+        seconds: float | None = None,
+        fps: float | None = None,
+        progress: bool | None = False,
+    ) -> Trajectory:
+        """Makes steps and returns their frames, the present one first.
 
         Args:
-            steps: how many, at least 0.
+            steps: how many, at least 0; or
+            seconds: how long, at least 0: as many steps as it takes to get there.
+            fps: frames in a second of simulated time, at most one a step; None: one a step. Frame k is at k / fps:
+                where that is between two steps, on the straight line between their states.
             progress: whether to show a progress bar on stderr; None: where that is a terminal.
 
         Raises:
-            InputError: more steps than the memory holds frames of.
+            InputError: an argument is out of its range, or more frames than the memory holds.
             SimulationError: where a step cannot be made; it has the frames before it, and the simulator stays at the
-                last of them. After this or another exception, Ctrl-C too, ``trajectory`` has them.
+                last step. After this or another exception, Ctrl-C too, ``trajectory`` has them.
         """
-        steps = integer("steps", steps, least=0)
         with self.lock:
-            trajectory, done = self._record(steps), 0
-            with _bar(steps, progress) as bar:
-                while done < steps:
-                    asked = min(self.chunk, steps - done)
+            pace, done = Pace.of(self.step_size, steps, seconds, every_of(fps, self.step_size)), 0
+            self._record(pace)
+            with bar(pace.steps, progress) as shown:
+                while done < pace.steps:
+                    asked = min(self.chunk, pace.steps - done)
                     made = self.run_chunk(asked)
                     done += made
-                    if bar is not None:
-                        bar.set_description("simulating", refresh=False)
-                        bar.update(made)
+                    if shown is not None:
+                        shown.set_description("simulating", refresh=False)
+                        shown.update(made)
                     if made < asked:
-                        self.fail(done + 1, trajectory.cut(done + 1))
+                        self.fail(done + 1, self.trajectory)
+            trajectory = self.trajectory
             self.stepper.frames.recording = None
         return trajectory
 
-    @alone
-    def _record(self, steps: int) -> Trajectory:
-        return self.stepper.frames.record(steps, self.stepper.steps_done)
-
 
 def _made(
+    simulator: Simulator,
     scene: Scene,
     *,
     integrator: str,
@@ -252,6 +245,7 @@ def _made(
     energy_watch: bool,
     chunk: int | None,
     differentiable: bool,
+    hook: Any,
     max_iterations: int | None,
     **options: Any,
 ) -> Stepper:
@@ -261,7 +255,10 @@ def _made(
         integer("max_iterations", max_iterations, least=1, most=LARGEST)
     step_error = checked_step_error(step_error, integrator, differentiable)
     check_contact(scene, integrator)
-    model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, **options)
+    if hook is not None and not callable(hook):
+        raise InputError(f"hook = {hook!r}, must be a function of the simulator, or None")
+    hooked = hook is not None
+    model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, hooked=hooked, **options)
     model.energy.on = model.energy.on and bool(energy_watch)
     model.contact.damps_impacts = bool(energy_watch)
     refuse_recording(model.device)
@@ -270,10 +267,12 @@ def _made(
         at_once.estimate_errors()
     fallback = None if method.fallback is None else lambda: INTEGRATORS[method.fallback](model)
     substepping = Substepping(model, at_once, step_error and step_error * scene.cloth.shortest_spacing, fallback)
-    frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes))
+    frames = Frames(model, checked_chunk(chunk, scene.cloth.nodes, one=hooked or bool(model.inputs.functions)))
     # unchecked: the cloth was, and copies of large ones would be the most memory that a run takes
     frames.upload(frames.rest())
-    return Stepper(model, at_once, substepping, frames)
+    stepper = Stepper(model, at_once, substepping, frames)
+    stepper.before_step = None if hook is None else lambda: hook(simulator)
+    return stepper
 
 
 def _rebuilt(
@@ -297,10 +296,3 @@ def _rebuilt(
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size
     return result
-
-
-def _bar(steps: int, progress: bool | None) -> contextlib.AbstractContextManager[tqdm.tqdm | None]:
-    """Makes a progress bar where one is wanted. Elsewhere there is none at all: tqdm's lock does not survive Ctrl-C."""
-    if progress is None:
-        progress = sys.stderr is not None and sys.stderr.isatty()
-    return tqdm.tqdm(total=steps, unit="step", leave=False, desc="starting") if progress else contextlib.nullcontext()

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, overload
 
 import numpy as np
 
-from ..description.cloth import CLOTH_NUMBERS, Cloth
+from ..description.cloth import Cloth
 from ..description.cloths import Cloths
-from ..description.obstacles import Box, Capsule, Contact, Cylinder, Obstacle, Plane, Sphere, TriangleMesh
-from ..description.scene import Scene, Wind
-from ..description.weave import Weave
-from ..description.yarn import SIZES, Yarn
-from ..errors import InputError, choice, finite_array, integer, real
-from ..io.files import atomic_write
+from ..description.scene import Scene
+from ..errors import InputError, brief, finite_array, integer, real
+from .packing import packed, packed_cloths, unpacked, unpacked_cloths, warn_of_functions
 
-FORMAT = 5
+FORMAT = 6
 """Of recordings: 1 had no number, no scene and no count of steps; 2 had no obstacles, no contact and one cloth; 3 had
-single numbers of cloths, no crimp and no sizes of yarns; 4 had no outlines and no seams."""
-
-SHAPES = {cls.shape: cls for cls in (Box, Capsule, Cylinder, Plane, Sphere, TriangleMesh)}
+single numbers of cloths, no crimp and no sizes of yarns; 4 had every step, and did not say which method made them;
+5 had no wind that changes from step to step, no outlines and no seams, or else every step."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -69,12 +66,27 @@ WIDTHS = {"position": 3, "euler": 2, "velocity": 3, "euler_velocity": 2, "anchor
 """Numbers of a node."""
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class End:
+    """What a run goes on from.
+
+    Args:
+        state: after a whole step, in double precision.
+        steps_done: steps until then.
+        next_size: of the next part of a step, in steps, where steps follow their error.
+    """
+
+    state: State
+    steps_done: int
+    next_size: float = 1.0
+
+
 @dataclasses.dataclass(eq=False)
 class Trajectory:
-    """Every frame of a simulation, the initial state first: arrays as in State, with a leading axis of frames.
+    """Frames of a simulation, the initial state first: arrays as in State, with a leading axis of frames.
 
-    A simulator goes on from one by ``simulator.state = trajectory[-1]`` and
-    ``simulator.steps_done = trajectory.steps_done``.
+    ``trajectory[3]`` is a State, ``trajectory[::10]`` a Trajectory, which shares its arrays.
+    ``Simulator.resumed(trajectory)`` goes on from its end.
     """
 
     cloth: Cloth | Cloths
@@ -87,28 +99,60 @@ class Trajectory:
     anchor: np.ndarray
     scene: Scene | None = None
     """What was simulated; None: not known."""
-    start: int = 0
-    """Steps made before the first frame."""
+    start: float = 0
+    """Steps made before the first frame: a whole number, but where that is a frame between two steps."""
+    every: float = 1
+    """Steps from frame to frame. Where that is no whole number, frames between two steps are on a straight line."""
+    options: dict[str, Any] | None = None
+    """What the simulator was made with that decides how its steps come out, by name; None: not known."""
+    end: End | None = None
+    """What a run goes on from that left these frames; None: the last of them, where it is the state after a step."""
 
     @property
     def steps_done(self) -> int:
-        """Steps made until the last frame."""
-        return self.start + len(self) - 1
+        """Steps made until the end; an InputError where the last frame lies between two, and no end is known."""
+        if self.end is not None:
+            return self.end.steps_done
+        last = self.start + self.every * (len(self) - 1)
+        if abs(last - round(last)) > 1e-6:
+            raise InputError(f"the last frame is after {last:g} steps, which no run goes on from")
+        return round(last)
 
     def __eq__(self, other: object) -> bool:
         """Tells whether two have the same frames of the same cloth, to the last bit."""
         if not isinstance(other, Trajectory):
             return NotImplemented
-        if not self.cloth.same_as(other.cloth) or (self.step, self.start) != (other.step, other.start):
+        times = [(trajectory.step, trajectory.start, trajectory.every) for trajectory in (self, other)]
+        if not self.cloth.same_as(other.cloth) or times[0] != times[1]:
             return False
         return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in FIELDS)
 
     def __len__(self) -> int:
         return len(self.position)
 
-    def __getitem__(self, frame: int) -> State:
-        """Copies one frame, as a State; negative frames count from the end."""
-        return State(*(getattr(self, name)[frame].copy() for name in FIELDS))
+    @overload
+    def __getitem__(self, frame: int) -> State: ...
+
+    @overload
+    def __getitem__(self, frame: slice) -> Trajectory: ...
+
+    def __getitem__(self, frame: int | slice) -> State | Trajectory:
+        """Copies one frame, as a State; negative frames count from the end. Takes some of them, as a Trajectory."""
+        if not isinstance(frame, slice):
+            return State(*(getattr(self, name)[frame].copy() for name in FIELDS))
+        begin, _, stride = frame.indices(len(self))
+        if stride < 1:
+            raise InputError(f"trajectory[::{stride}], must take frames in their order")
+        parts: dict[str, Any] = {name: getattr(self, name)[frame] for name in FIELDS}
+        taken = range(len(self))[frame]
+        return dataclasses.replace(
+            self,
+            **parts,
+            step=self.step * stride,
+            start=self.start + self.every * begin,
+            every=self.every * stride,
+            end=self.end if taken and taken[-1] == len(self) - 1 else None,
+        )
 
     @property
     def time(self) -> np.ndarray:
@@ -117,8 +161,7 @@ class Trajectory:
 
     def cut(self, frames: int) -> Trajectory:
         """Takes the first frames of it."""
-        parts: dict[str, Any] = {name: getattr(self, name)[:frames] for name in FIELDS}
-        return dataclasses.replace(self, **parts)
+        return self[:frames]
 
     def joined(self, later: Trajectory) -> Trajectory:
         """Joins this and a run that went on from its last frame.
@@ -128,7 +171,7 @@ class Trajectory:
                 keeps) are others.
         """
         if not isinstance(later, Trajectory):
-            raise InputError(f"later = {later!r}, must be a Trajectory")
+            raise InputError(f"later = {brief(later)}, must be a Trajectory")
         if not len(self) or not len(later):
             raise InputError(f"trajectories of {len(self)} and {len(later)} frames, must have at least one each")
         if later.step != self.step:
@@ -137,8 +180,11 @@ class Trajectory:
             raise InputError("later.cloth is another one than that of the frames before")
         if self.scene is not None and later.scene is not None and not later.scene.same_as(self.scene):
             raise InputError("later.scene is another one than that of the frames before")
-        if later.start != self.steps_done:
-            raise InputError(f"later.start = {later.start}, must be the steps until here, {self.steps_done}")
+        if later.every != self.every:
+            raise InputError(f"later.every = {later.every:g}, must be that of the frames before, {self.every:g}")
+        last = self.start + self.every * (len(self) - 1)
+        if abs(later.start - last) > 1e-6:
+            raise InputError(f"later.start = {later.start:g}, must be the steps until here, {last:g}")
         for name in FIELDS:
             end, begin = getattr(self, name)[-1], getattr(later, name)[0]
             off = np.abs(begin - end).max()
@@ -147,202 +193,71 @@ class Trajectory:
         parts: dict[str, Any] = {
             name: np.concatenate([getattr(self, name), getattr(later, name)[1:]]) for name in FIELDS
         }
-        return dataclasses.replace(self, **parts)
+        return dataclasses.replace(self, **parts, end=later.end)
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes an .npz file with the cloth, its scene and every frame; it appears whole or not at all."""
-        with atomic_write(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(
-                file,
-                format=FORMAT,
-                start=self.start,
-                step=self.step,
-                **_packed_cloths(self.cloth),
-                **{name: getattr(self, name) for name in FIELDS},
-                **({} if self.scene is None else _packed(self.scene)),
-            )
+    def save(self, path: str | os.PathLike, *, precision: str = "double", compression: int = 6) -> None:
+        """Writes the cloth, its scene, every frame, and what a run goes on from; the file appears whole or not at all.
+        A scene with functions is left out, with a WarpYarnWarning: no file holds them.
+
+        Args:
+            path: of the file, ending in .h5 or .hdf5 (needs the extra ``data``), or an .npz of any name.
+            precision: of the frames, "double" or "single"; what a run goes on from is always double.
+            compression: from 0 (none, fast) to 9 (small, slow).
+
+        Raises:
+            InputError: an argument is out of its range, or the folder does not exist.
+            OSError: the file cannot be written, such as to a full disk.
+        """
+        from ..io.recordings import save
+
+        warn_of_functions(path, self.scene)
+        save(path, self, precision, compression)
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> Trajectory:
-        """Reads what ``save`` wrote; an InputError says what is wrong with the file."""
-        try:
-            with np.load(path) as data:
-                written = integer("format", data["format"].item(), least=1) if "format" in data else 1
-                if written > FORMAT:
-                    raise InputError(f"format = {written}, this warp_yarn reads up to {FORMAT}: it needs a newer one")
-                cloth = _unpacked_cloths(data)
-                frames = len(np.atleast_1d(data["position"]))
-                if not frames:
-                    raise InputError("has no frame, must have at least one")
-                values: dict[str, Any] = {
-                    name: finite_array(name, data[name], (frames, cloth.nodes, WIDTHS[name])) for name in FIELDS
-                }
-                return cls(
-                    cloth,
-                    real("step", data["step"].item(), above=0.0),
-                    **values,
-                    scene=_unpacked(cloth, data) if "scene_terms" in data else None,
-                    start=integer("start", data["start"].item(), least=0) if "start" in data else 0,
-                )
-        except FileNotFoundError as error:
-            raise InputError(f"{Path(path)}: there is no such file") from error
-        except InputError as error:
-            raise InputError(f"{Path(path)}: {error}") from error
-        except Exception as error:  # zip, pickle and key errors of a foreign or truncated file
-            raise InputError(f"{Path(path)}: not a recording of warp_yarn ({error})") from error
+    def load(cls, path: str | os.PathLike, frames: slice | None = None) -> Trajectory:
+        """Reads what ``save`` or ``Simulator.record`` wrote; an InputError says what is wrong with the file.
 
+        Args:
+            frames: which of them, such as ``slice(0, None, 10)``: the others take no memory. None: all.
+        """
+        from ..io.recordings import load
 
-def _packed_cloths(cloth: Cloth | Cloths) -> dict[str, Any]:
-    """Packs a cloth into arrays; of several each with its number before their names."""
-    if isinstance(cloth, Cloths):
-        parts = [_packed_cloths(each) for each in cloth.cloths]
-        return {"cloths": len(parts)} | {
-            f"cloth_{k}_{name}": parts[k][name] for k in range(len(parts)) for name in parts[k]
-        }
-    given = {name: cloth._arguments[name] for name in CLOTH_NUMBERS}
-    if given["friction_damping"] is None:
-        given["friction_damping"] = np.nan  # of its own mass, also where others are beside it
-    for name in ("spacing", "crimp"):
-        value = cloth._arguments[name]
-        warp, weft = value if isinstance(value, tuple) else (value, None)
-        given |= {name: warp} if weft is None else {name: warp, f"{name}_weft": weft}
-    sizes = [[np.nan if size is None else size for size in yarn.sizes] for yarn in cloth.yarns]
-    return {
-        "draft": cloth.weave.flipped,
-        "weave": cloth.weave.name,
-        "yarns": np.array([(yarn.density, yarn.stretch, yarn.bend) for yarn in cloth.yarns]),
-        "sizes": np.array(sizes),
-        "colors": np.array([yarn.color or (np.nan,) * 3 for yarn in cloth.yarns]),
-        "warp": cloth.warp,
-        "weft": cloth.weft,
-        "rest": cloth.position,
-        **_packed_outline(cloth),
-        **given,
-    }
+        return load(path, frames)
 
+    def head(self) -> dict[str, Any]:
+        """Packs all but the frames into arrays; a scene with functions is left out."""
+        end, scene = self.end, self.scene
+        values: dict[str, Any] = {"format": FORMAT, "start": self.start, "step": self.step, "every": self.every}
+        if end is not None:
+            state = end.state.checked(self.cloth.nodes)
+            values |= {"end_steps": end.steps_done, "end_next_size": end.next_size}
+            values |= {f"end_{name}": getattr(state, name) for name in FIELDS}
+        if self.options is not None:
+            values["options"] = json.dumps(self.options, default=float)
+        known = {} if scene is None or scene.functions else packed(scene)
+        return {**values, **packed_cloths(self.cloth), **known}
 
-def _packed_outline(cloth: Cloth) -> dict[str, Any]:
-    """Packs what a cloth is cut to."""
-    if cloth.outline is None:
-        return {}
-    corners = np.concatenate([np.zeros((0, 2)), *cloth.holes])
-    return {"outline": cloth.outline, "holes": corners, "hole_corners": [len(hole) for hole in cloth.holes]}
-
-
-def _unpacked_cloths(data: Any) -> Cloth | Cloths:
-    """Makes what ``_packed_cloths`` made arrays of."""
-    if "cloths" in data:
-        count = integer("cloths", data["cloths"].item(), least=1)
-        return Cloths([_unpacked_cloth(data, f"cloth_{k}_") for k in range(count)])
-    return _unpacked_cloth(data, "")
-
-
-def _unpacked_cloth(data: Any, of: str) -> Cloth:
-    yarns = [
-        Yarn(density=d, stretch=s, bend=b, color=None if np.isnan(color).any() else tuple(color.tolist()))
-        for (d, s, b), color in zip(data[f"{of}yarns"].tolist(), data[f"{of}colors"], strict=True)
-    ]
-    if f"{of}sizes" in data:
-        sizes = [dict(zip(SIZES, each, strict=True)) for each in data[f"{of}sizes"].tolist()]
-        sizes = [{name: size for name, size in each.items() if not np.isnan(size)} for each in sizes]
-        yarns = [dataclasses.replace(yarn, **each) for yarn, each in zip(yarns, sizes, strict=True)]
-
-    def value(name: str) -> Any:
-        array = data[f"{of}{name}"]
-        return array if array.ndim else array.item()
-
-    numbers = {name: value(name) for name in (*CLOTH_NUMBERS, "crimp") if f"{of}{name}" in data}
-    for name in ("spacing", "crimp"):
-        if f"{of}{name}_weft" in data:
-            numbers[name] = numbers[name], value(f"{name}_weft")
-    if np.isnan(numbers["friction_damping"]).any():
-        numbers["friction_damping"] = None
-    ends = np.cumsum(data[f"{of}hole_corners"]) if f"{of}hole_corners" in data else ()
-    return Cloth(
-        Weave(data[f"{of}draft"], str(data[f"{of}weave"])),
-        yarns=yarns,
-        warp=data[f"{of}warp"].tolist(),
-        weft=data[f"{of}weft"].tolist(),
-        pose=data[f"{of}rest"],
-        outline=data.get(f"{of}outline"),
-        holes=np.split(data[f"{of}holes"], ends[:-1]) if len(ends) else (),
-        **numbers,
-    )
-
-
-def _packed(scene: Scene) -> dict[str, Any]:
-    """Packs a scene into arrays; what is None is left out."""
-    wind = scene.wind
-    values = {
-        "terms": np.array(scene.terms),
-        "sliding": scene.sliding,
-        "published_scaling": scene.published_scaling,
-        "gravity": scene.gravity,
-        "pins": scene.pins,
-        "pin_stiffness": scene.pin_stiffness,
-        "pin_path": scene.pin_path,
-        "seams": scene.seams,
-        "seam_stiffness": scene.seam_stiffness,
-        "wind": None if wind is None else [*wind.velocity, wind.density, wind.drag],
-        "force_nodes": scene.force_nodes,
-        **{f"force_{node}": force for node, force in scene.forces.items()},
-        "parameters": list(scene.parameters) or None,
-        **{f"parameter_{name}": values for name, values in scene.parameters.items()},
-        "self_contact": scene.self_contact,
-        # left out where they are what recordings of before have
-        "pressing": None if scene.contact_force == "published" else scene.contact_force,
-        "crimp_interchange": scene.crimp_interchange or None,
-        # None is a value of its own there, not always the default
-        **{f"contact_{name}": np.nan if value is None else value for name, value in scene.contact._arguments.items()},
-        "obstacles": np.array([obstacle.shape for obstacle in scene.obstacles], dtype=str),
-    }
-    for k, obstacle in enumerate(scene.obstacles):
-        values.update({f"obstacle_{k}_{name}": value for name, value in obstacle._arguments.items()})
-    return {f"scene_{name}": value for name, value in values.items() if value is not None}
-
-
-def _unpacked(cloth: Cloth | Cloths, data: Any) -> Scene:
-    """Makes the scene that ``_packed`` made arrays of."""
-
-    def value(name: str) -> Any:
-        return data.get(f"scene_{name}")
-
-    wind, stiffness, named = value("wind"), value("pin_stiffness"), value("parameters")
-    return Scene(
-        cloth,
-        gravity=value("gravity"),
-        wind=None if wind is None else Wind(velocity=wind[:3], density=wind[3], drag=wind[4]),
-        pins=value("pins"),
-        pin_stiffness=None if stiffness is None else stiffness.item(),
-        pin_path=value("pin_path"),
-        forces={node: value(f"force_{node}") for node in value("force_nodes").tolist()},
-        sliding=value("sliding").item(),
-        terms=value("terms").tolist(),
-        published_scaling=value("published_scaling").item(),
-        parameters={} if named is None else {name: value(f"parameter_{name}").tolist() for name in named.tolist()},
-        obstacles=_unpacked_obstacles(data),
-        self_contact="scene_self_contact" in data and value("self_contact").item(),
-        contact=Contact(**_arguments(data, "contact")),
-        **(
-            {"seams": value("seams"), "seam_stiffness": value("seam_stiffness").item()} if "scene_seams" in data else {}
-        ),
-        contact_force=value("pressing").item() if "scene_pressing" in data else "published",
-        crimp_interchange="scene_crimp_interchange" in data,
-    )
-
-
-def _unpacked_obstacles(data: Any) -> list[Obstacle]:
-    """Makes the obstacles, of which recordings of before have none."""
-    shapes = data["scene_obstacles"].tolist() if "scene_obstacles" in data else []
-    return [
-        SHAPES[choice("obstacles", shape, SHAPES)](**_arguments(data, f"obstacle_{k}"))
-        for k, shape in enumerate(shapes)
-    ]
-
-
-def _arguments(data: Any, group: str) -> dict[str, Any]:
-    """Gives what something was made of: arrays, and numbers and names as such; NaN is None."""
-    start = f"scene_{group}_"
-    found = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
-    values = {name: array if array.ndim else array.item() for name, array in found.items()}
-    return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}
+    @classmethod
+    def of_head(cls, data: Mapping[str, Any]) -> Trajectory:
+        """Makes a trajectory without frames of what ``head`` packed; an InputError says what is wrong."""
+        written = integer("format", data["format"].item(), least=1) if "format" in data else 1
+        if written > FORMAT:
+            raise InputError(f"format = {written}, this warp_yarn reads up to {FORMAT}: it needs a newer one")
+        cloth, end = unpacked_cloths(data), None
+        if "end_steps" in data:
+            state = State(**{name: data[f"end_{name}"] for name in FIELDS}).checked(cloth.nodes)
+            steps = integer("end_steps", data["end_steps"].item(), least=0)
+            end = End(state, steps, real("end_next_size", data["end_next_size"].item(), above=0.0))
+        start = real("start", data["start"].item(), least=0.0) if "start" in data else 0
+        every = real("every", data["every"].item(), above=0.0) if "every" in data else 1
+        empty: dict[str, Any] = {name: np.empty((0, cloth.nodes, width)) for name, width in WIDTHS.items()}
+        return cls(
+            cloth,
+            real("step", data["step"].item(), above=0.0),
+            **empty,
+            scene=unpacked(cloth, data) if "scene_terms" in data else None,
+            start=int(start) if start == int(start) else start,
+            every=int(every) if every == int(every) else every,
+            options=json.loads(data["options"].item()) if "options" in data else None,
+            end=end,
+        )

@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..kernels.core.status import CROWDED, GAINED, IMPACT
 from .checks import LARGEST
 from .frames import Frames
+from .hooks import prepare
 from .state import State
 from .substepping import Substepping
 
@@ -40,7 +41,6 @@ class _StepInParts:
 
 class Stepper:
     """Makes steps. An exception may come between any two of its operations: ``settle`` comes before the next call.
-
     Whoever calls it holds the simulator's lock.
 
     Args:
@@ -53,6 +53,7 @@ class Stepper:
         steps_done: steps since the beginning.
         split_steps: which of them could not be made at once by the method, and their smallest part [s].
         damped_steps: those of them that the fallback made, or parts of them.
+        before_step: a hook, called before each step; None: there is none.
     """
 
     def __init__(self, model: Model, integrator: Any, substepping: Substepping, frames: Frames):
@@ -61,6 +62,7 @@ class Stepper:
         self.steps_done = 0
         self.split_steps: dict[int, float] = {}
         self.damped_steps: set[int] = set()
+        self.before_step: Callable[[], None] | None = None
         self._graphs = GraphCache(model.device)
         self._chunk: int | None = None
         """Steps done when the chunk began that is being made, and None where none is: frames on the device."""
@@ -106,8 +108,7 @@ class Stepper:
             self._owed = None
 
     def settle(self) -> None:
-        """Finishes or takes back what an exception left half done. It may come again meanwhile: then this begins
-        anew."""
+        """Finishes or takes back what an exception left half done; after another one meanwhile it begins anew."""
         self._end_team()
         if self._chunk is not None:
             self._close_chunk(self._chunk, self._frames_made())
@@ -146,6 +147,7 @@ class Stepper:
             How many steps were made; fewer than asked for where one failed (``arrays["status"]`` says how).
         """
         try:
+            prepare(self)
             with ALONE, compiling():
                 refuse_recording(self.model.device)
                 self.settle()
@@ -222,12 +224,11 @@ class Stepper:
                 self._step_in_parts = None
                 return True
         if whole:
-            # it could not be made at once
             gained = parts.can_damp and self._status() in (GAINED, IMPACT)
             self.frames.restore(frame)
             self.arrays.put("status", 0, 0, 0)
             parts.next_size = 1.0 if gained else 0.5
-        smallest = parts.make(lambda: self._count(frame), gained=gained)
+        smallest = parts.make(lambda: self._count(frame), self.make_room, gained=gained)
         self.integrator.set_times(self.model.step_size, self.model.step_size)
         if not smallest:
             return False

@@ -13,7 +13,7 @@ from ..device.arrays import STATE_TYPES
 from ..device.exclusive import ALONE
 from ..device.graphs import GraphCache
 from ..device.model import Model
-from ..kernels.core.status import GAINED, IMPACT, INACCURATE
+from ..kernels.core.status import CROWDED, GAINED, IMPACT, INACCURATE
 from ..moved import renamed, renamed_attribute
 
 SMALLEST = 2.0**-7
@@ -73,11 +73,12 @@ class Substepping:
         if self._fallback is not None:
             self._fallback.forget_graphs()
 
-    def make(self, count: Callable[[], None], *, gained: bool = False) -> float:
+    def make(self, count: Callable[[], None], make_room: Callable[[], None], *, gained: bool = False) -> float:
         """Makes a step from the present state.
 
         Args:
             count: tells the device which frame the step starts from, before each part.
+            make_room: for more that is near, where a part finds more than there is room for.
             gained: whether the whole step was seen to gain energy.
 
         Returns:
@@ -93,11 +94,11 @@ class Substepping:
             parts = max(1, math.ceil(left / self.next_size - 1e-9))
             size = self.last_size = left / parts
             self._copy("kept_", "")
-            method, accepted = self.method, not gained and self._try(self.method, count, size, left)
+            method, accepted = self.method, not gained and self._try(self.method, count, make_room, size, left)
             if not accepted and self._is_to_damp(gained, least):
                 gained = False
                 self._restore()
-                accepted = self._damp(count, size, left, last=0.5 * size < least)
+                accepted = self._damp(count, make_room, size, left, last=0.5 * size < least)
                 method = self._fallback
             if not accepted:
                 self.rejected += 1
@@ -112,11 +113,18 @@ class Substepping:
             done = 1.0 if parts == 1 else done + size
         return smallest
 
-    def _try(self, method: Any, count: Callable[[], None], size: float, left: float) -> bool:
+    def _try(
+        self, method: Any, count: Callable[[], None], make_room: Callable[[], None], size: float, left: float
+    ) -> bool:
         """Makes a part, and says whether it is good."""
         count()
         method.set_times(size * self.model.step_size, left * self.model.step_size)
         method.advance()
+        while self._status() == CROWDED:
+            make_room()
+            self._restore()
+            count()
+            method.advance()
         if method is self.method:
             return self._accepts(size)
         self.next_size = size if self._status() == 0 else 0.5 * size
@@ -129,14 +137,16 @@ class Substepping:
             return False
         return gained or self._status() in (GAINED, IMPACT) or self.next_size < least
 
-    def _damp(self, count: Callable[[], None], size: float, left: float, *, last: bool) -> bool:
+    def _damp(
+        self, count: Callable[[], None], make_room: Callable[[], None], size: float, left: float, *, last: bool
+    ) -> bool:
         """Makes a part by the fallback, and says whether it is good. The last resort, which cannot be halved, may gain
         more."""
         if self._fallback is None:
             with ALONE:
                 self._fallback = self._make_fallback()
         self.model.arrays.put("damps", 2 if last else 1)
-        accepted = self._try(self._fallback, count, size, left)
+        accepted = self._try(self._fallback, count, make_room, size, left)
         self.model.arrays.put("damps", 0)
         self.damped += accepted
         return accepted

@@ -1,13 +1,10 @@
-"""What a trajectory looks like: every yarn a smooth curve over and under the others, and a tube around it.
-
-At a crossing a warp yarn passes at x − R n and a weft yarn at x + R n, n the contact normal from warp to weft, R half
-the yarn's thickness. On the
-border there is no normal and no offset. Between these points runs the Catmull-Rom spline through them.
-"""
+"""What of a trajectory can be drawn: where its cloth is and which way it faces, and where obstacles are."""
 
 from __future__ import annotations
 
 import dataclasses
+import weakref
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,8 +12,9 @@ import warp as wp
 from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from ..description.obstacles import Obstacle, TriangleMesh
+from ..device import start
 from ..device.exclusive import ALONE, compiling, refuse_recording
-from ..errors import InputError, finite_array
+from ..errors import InputError, brief, finite_array
 from ..kernels import Variant, build
 from ..simulation.state import Trajectory
 
@@ -31,110 +29,6 @@ PLANE_MARGIN = 0.15
 
 BACK = np.array([-1.0, -1.0, -1.0, 1.0])
 """Times a quaternion (x, y, z, w): what turns back."""
-
-CATMULL_ROM = 0.5 * np.array(
-    [[0.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [2.0, -5.0, 4.0, -1.0], [-1.0, 3.0, -3.0, 1.0]]
-)
-"""Weights of four consecutive points by powers of t; the curve runs from the second (t = 0) to the third (t = 1)."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Strands:
-    """All yarns of one material."""
-
-    material: int
-    """Index into the cloth's yarns."""
-    color: tuple[float, float, float]
-    """Red, green, blue from 0 to 1, sRGB."""
-    radius: float
-    """Half the yarns' thickness [m]."""
-    counts: np.ndarray
-    """[yarns]: points of each yarn."""
-    points: np.ndarray
-    """[frames, sum of counts, 3]: where the yarns pass at their nodes, yarn after yarn [m]."""
-
-    @property
-    def repeated(self) -> np.ndarray:
-        """For each control point its index in points: those of a yarn in order, the first and the last twice."""
-        yarns = np.split(np.arange(self.counts.sum()), self.counts.cumsum()[:-1])
-        return np.concatenate([np.pad(yarn, 1, mode="edge") for yarn in yarns])
-
-    def sampled(self, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Finds points on the curves, `samples` a segment and the last end.
-
-        Returns:
-            The number of points of each yarn [yarns], the points [frames, sum, 3] (m), unit tangents there.
-        """
-        counts = (self.counts - 1) * samples + 1
-        first = np.repeat(self.counts.cumsum() - self.counts, counts)
-        last = np.repeat(self.counts.cumsum() - 1, counts)
-        along = np.arange(counts.sum()) - np.repeat(counts.cumsum() - counts, counts)
-        segment = np.minimum(first + along // samples, last - 1)
-        t = (along - (segment - first) * samples) / samples
-        one = np.ones_like(t)
-        weights = np.stack([one, t, t**2, t**3], axis=1) @ CATMULL_ROM
-        slopes = np.stack([0 * one, one, 2 * t, 3 * t**2], axis=1) @ CATMULL_ROM
-        centres = np.zeros((len(self.points), len(t), 3))
-        tangents = np.zeros_like(centres)
-        for k in range(4):
-            points = self.points[:, np.clip(segment + k - 1, first, last)]
-            centres += weights[:, k, None] * points
-            tangents += slopes[:, k, None] * points
-        return counts, centres, _unit(tangents)
-
-
-@dataclasses.dataclass(frozen=True)
-class Tubes:
-    """Tubes around strands: rings of vertices along each yarn, and a flat cap at each end."""
-
-    centres: np.ndarray
-    """[frames, rings, 3] (m)."""
-    across: np.ndarray
-    """[frames, rings, 2, 3]: two unit vectors that span each ring; with the yarn's direction they are right-handed."""
-    counts: np.ndarray
-    """[yarns]: rings of each yarn."""
-    radius: float
-    sides: int
-
-    @classmethod
-    def around(cls, strands: Strands, *, sides: int, samples: int) -> Tubes:
-        """Makes tubes with `samples` rings a segment; rings do not twist, along the yarn or from frame to frame."""
-        counts, centres, tangents = strands.sampled(samples)
-        start = counts.cumsum() - counts
-        first = np.empty_like(tangents)
-        # Any start at a right angle will do for frame 0. Later frames follow it: chosen anew, rings would jump.
-        axis = np.eye(3)[np.abs(tangents[0, start]).argmin(axis=1)]
-        first[0, start] = _unit(np.cross(tangents[0, start], axis))
-        for frame in range(1, len(first)):
-            first[frame, start] = _transported(
-                first[frame - 1, start], tangents[frame - 1, start], tangents[frame, start]
-            )
-        for k in range(1, counts.max()):
-            i = start[counts > k] + k
-            first[:, i] = _transported(first[:, i - 1], tangents[:, i - 1], tangents[:, i])
-        return cls(centres, np.stack([first, np.cross(tangents, first)], axis=2), counts, strands.radius, sides)
-
-    def normals(self, frame: int) -> np.ndarray:
-        """Finds unit vectors out of the yarn at every vertex of one frame [rings · sides, 3], ring after ring."""
-        angle = 2.0 * np.pi * np.arange(self.sides) / self.sides
-        return (np.stack([np.cos(angle), np.sin(angle)], axis=1) @ self.across[frame]).reshape(-1, 3)
-
-    def vertices(self, frame: int) -> np.ndarray:
-        """Finds the vertices of one frame [rings · sides, 3] (m)."""
-        return np.repeat(self.centres[frame], self.sides, axis=0) + self.radius * self.normals(frame)
-
-    def faces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lists the number of corners of each face, and the vertices at them, counter-clockwise seen from outside."""
-        side = np.arange(self.sides)
-        end = self.counts.cumsum()
-        ring = np.delete(np.arange(end[-1]), end - 1)[:, None] * self.sides
-        this, following = ring + side, ring + np.roll(side, -1)
-        quads = np.stack([this, following, following + self.sides, this + self.sides], axis=2)
-        caps = np.stack(
-            [(end - self.counts)[:, None] * self.sides + side[::-1], (end - 1)[:, None] * self.sides + side]
-        )
-        corners = np.repeat([4, self.sides], [quads.shape[0] * self.sides, 2 * len(end)])
-        return corners, np.concatenate([quads.ravel(), caps.ravel()])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,25 +87,36 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
     """Lists the obstacles of a trajectory's scene.
 
     Args:
-        at: when its frames are, in steps since the first frame of the run [frames], which need not be whole; None: 0,
-            1, 2, ...
+        at: when its frames are, in frames since the first of the run [frames], which need not be whole; None: 0, 1, 2,
+            ...
     """
     if trajectory.scene is None:
         return []
     at = np.arange(len(trajectory)) if at is None else np.asarray(at)
-    points = trajectory.position
     result = []
     for obstacle in trajectory.scene.obstacles:
-        position, rotation = _poses(obstacle, trajectory.start + at)
+        position, rotation = _poses(obstacle, trajectory.start + trajectory.every * at)
         width = length = 0.0
         if obstacle.shape == "plane":
             # a rectangle of its own, which moves as it does, under all of the cloth at all times
-            local = _turned(rotation[:, None] * BACK, points - position[:, None])[..., :2]
-            low, high = local.min(axis=(0, 1)), local.max(axis=(0, 1))
+            low, high = np.full(2, np.inf), np.full(2, -np.inf)
+            for k, when in enumerate(at.tolist()):
+                local = _turned(rotation[k] * BACK, between(trajectory.position, when) - position[k])[:, :2]
+                low, high = np.minimum(low, local.min(axis=0)), np.maximum(high, local.max(axis=0))
             width, length = (high - low + 2.0 * PLANE_MARGIN * (high - low).max()).tolist()
             position = position + _turned(rotation, np.append(0.5 * (low + high), 0.0))
         result.append(Placed(obstacle, position, rotation, width, length))
     return result
+
+
+def between(position: np.ndarray, at: float) -> np.ndarray:
+    """Gives positions [nodes, 3] at a frame, which need not be whole: in between along straight lines."""
+    before = min(int(at), len(position) - 1)
+    after = min(before + 1, len(position) - 1)
+    if before == at:
+        return position[before]
+    share = at - before
+    return (1.0 - share) * position[before] + share * position[after]
 
 
 def _poses(obstacle: Obstacle, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -241,63 +146,34 @@ def _turned(q: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points + q[..., 3:] * twice + np.cross(q[..., :3], twice)
 
 
-def strands(trajectory: Trajectory) -> list[Strands]:
-    """Lists the yarns of every material that the cloth uses, at every frame."""
-    position = checked(trajectory)
-    cloth, topology = trajectory.cloth, trajectory.cloth.topology
-    normals = contact_normals(cloth, position)
-    order = np.argsort(topology.segment_yarn, kind="stable")
-    segments = topology.segment_nodes[order]
-    starts = np.flatnonzero(np.diff(topology.segment_yarn[order], prepend=-1))
-    yarns = [np.append(run[:, 0], run[-1, 1]) for run in np.split(segments, starts[1:])]
-    result = []
-    for k in np.unique(cloth.material).tolist():
-        mine = np.flatnonzero(cloth.material == k)
-        nodes = np.concatenate([yarns[y] for y in mine])
-        counts = np.array([len(yarns[y]) for y in mine])
-        side = np.repeat(2.0 * topology.yarn_direction[mine] - 1.0, counts)
-        radius = float(cloth.halves[mine[0], 1])
-        points = position[:, nodes] + side[:, None] * (radius * normals[:, nodes])
-        result.append(Strands(k, cloth.yarns[k].color or PALETTE[k % len(PALETTE)], radius, counts, points))
-    return result
-
-
 def checked(trajectory: Trajectory) -> np.ndarray:
     """Gives the positions of a trajectory that can be drawn [frames, nodes, 3] (m), or an InputError."""
     if not isinstance(trajectory, Trajectory):
-        raise InputError(f"trajectory = {trajectory!r}, must be a Trajectory, such as Simulator.run returns")
+        raise InputError(f"trajectory = {brief(trajectory)}, must be a Trajectory, such as Simulator.run returns")
     position = finite_array("trajectory.position", trajectory.position, (None, trajectory.cloth.nodes, 3))
     if not len(position):
         raise InputError("trajectory has no frame, must have at least one")
     return position
 
 
+_CROSSINGS: weakref.WeakKeyDictionary[Cloth | Cloths, list[Any]] = weakref.WeakKeyDictionary()
+"""Of cloths that were drawn, on the device: arguments of the kernel that finds normals, for which a film asks at every
+frame."""
+
+
 def contact_normals(cloth: Cloth | Cloths, position: np.ndarray) -> np.ndarray:
     """Computes unit normals from warp to weft at the crossings, 0 on the border, of positions [frames, nodes, 3]."""
-    topology, device = cloth.topology, wp.get_device("cpu")
+    device = start.device("cpu")
     with ALONE, compiling():
         refuse_recording(device)
         kernel = build(Variant(wp.float64, True))["contact_normal"]
+        if cloth not in _CROSSINGS:
+            topology = cloth.topology
+            kinds = {"crossing_node": int, "crossing_neighbours": wp.vec4i, "flipped": int}
+            _CROSSINGS[cloth] = [wp.array(getattr(topology, k), dtype=kind, device=device) for k, kind in kinds.items()]
         positions = wp.array(position, dtype=wp.vec3d, device=device)
         normals = wp.zeros_like(positions)
-        crossings = wp.array(topology.crossing_node, dtype=int, device=device)
-        neighbours = wp.array(topology.crossing_neighbours, dtype=wp.vec4i, device=device)
-        flipped = wp.array(topology.flipped, dtype=int, device=device)
+        dim = len(_CROSSINGS[cloth][0])
         for frame in range(len(position)):
-            inputs = [crossings, neighbours, flipped, positions[frame], normals[frame]]
-            wp.launch(kernel, dim=len(crossings), inputs=inputs, device=device)
+            wp.launch(kernel, dim=dim, inputs=[*_CROSSINGS[cloth], positions[frame], normals[frame]], device=device)
         return normals.numpy()
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Scales to length 1. Where a yarn has shrunk to a point it has no direction; 0 there keeps its tube finite."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
-
-
-def _transported(vectors: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Carries unit vectors at right angles to `before`, by the smallest rotation that takes `before` to `after`."""
-    along = (vectors * after).sum(axis=-1, keepdims=True)
-    fold = 1.0 + (before * after).sum(axis=-1, keepdims=True)
-    moved = vectors - (before + after) * (along / np.maximum(fold, 1e-12))
-    # Rounding adds up over hundreds of rings and frames, and a yarn folded flat has no smallest rotation.
-    return _unit(moved - after * (moved * after).sum(axis=-1, keepdims=True))

@@ -1,0 +1,4 @@
+"""Pictures: vertices around yarns, their colours, and triangles in a depth buffer.
+
+Knows nothing of simulations.
+"""

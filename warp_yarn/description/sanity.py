@@ -1,0 +1,89 @@
+"""Numbers that can be used and are likely given in another unit than SI: a warning that says which."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import WarpYarnWarning
+
+if TYPE_CHECKING:
+    from .cloth import Cloth
+
+DISTANCE = (1e-5, 5e-2)
+"""Of neighbouring yarns that anyone weaves or stands for others by [m]: from fine filaments to nets."""
+RADIUS = (1e-6, 2e-2)
+"""Of yarns [m]."""
+CRIMP = 0.6
+"""Of a distance: woven yarns have up to some 0.3; in % it would be 1 to 30."""
+AREA_DENSITY = (2e-3, 3e1)
+"""Mass of an area [kg/m²]: a veil has 4e-3, the paper's cloth 4.8, thick woven belts some 15."""
+ACCELERATION = 200.0
+"""Twenty times gravity [m/s²]: in cm/s² it is 980."""
+SPEED = 350.0
+"""Of wind [m/s], beyond sound: 10 m/s are 1000 cm/s."""
+
+
+def warn_of_units(cloth: Cloth) -> None:
+    """Warns where a cloth has distances, sizes, crimps or a mass that no fabric has."""
+    gaps = np.diff(cloth.lines[1]), np.diff(cloth.lines[0])
+    every = np.concatenate(gaps)
+    _check("spacing", every, DISTANCE, "m", "in metres: 1e-3 for a millimetre")
+    for name, values, usual in _sizes(cloth):
+        _check(name, np.array(values), usual, "m", "in metres: 5e-4 for half a millimetre")
+    _check("crimp", cloth.yarn_crimp, (0.0, CRIMP), "", "a part of the distance: 0.05 for 5 %")
+    density = np.array([yarn.density for yarn in cloth.yarns])[cloth.material]
+    long = density * (1.0 + cloth.yarn_crimp)
+    is_weft = cloth.topology.yarn_direction == 1
+    # yarns of both directions over an area; of distances that are wrong themselves enough has been said
+    mass = float(long[~is_weft].mean() / gaps[0].mean() + long[is_weft].mean() / gaps[1].mean())
+    least, most = AREA_DENSITY
+    if DISTANCE[0] <= every.min() and every.max() <= DISTANCE[1] and not least <= mass <= most:
+        apart = " and ".join(dict.fromkeys(f"{gap.mean():g}" for gap in gaps))
+        warnings.warn(
+            f"yarns of {density.min():g} to {density.max():g} kg/m, {apart} m apart, make a cloth of {1e3 * mass:.3g} "
+            f"g/m², fabrics have {1e3 * least:g} to {1e3 * most:.0f} g/m²: is density in kg/m? 1 tex is 1e-6 kg/m",
+            WarpYarnWarning,
+            stacklevel=3,
+        )
+
+
+def _sizes(cloth: Cloth) -> Iterator[tuple[str, list[float], tuple[float, float]]]:
+    """Gives the sizes that yarns of the cloth have, by the names that they were given by, and usual ones."""
+    used = [cloth.yarns[k] for k in np.unique(cloth.material)]
+    round_ones = [yarn.halves(cloth.radius)[0] for yarn in used if yarn.width is None]
+    flat = [yarn for yarn in used if yarn.width is not None]
+    diameter = 2.0 * RADIUS[0], 2.0 * RADIUS[1]
+    if round_ones:
+        yield "radius", round_ones, RADIUS
+    for name in ("width", "thickness") if flat else ():
+        yield name, [getattr(yarn, name) for yarn in flat], diameter
+
+
+def warn_of_acceleration(gravity: Any) -> None:
+    """Warns where gravity is likely in another unit."""
+    if isinstance(gravity, np.ndarray) and gravity.size:
+        size = np.linalg.norm(gravity.reshape(-1, 3), axis=1)
+        _check("gravity", size, (0.0, ACCELERATION), "m/s²", "in m/s²: 9.8")
+
+
+def warn_of_speed(velocity: Any) -> None:
+    """Warns where wind is likely in another unit."""
+    if not callable(velocity):
+        speed = np.linalg.norm(np.reshape(velocity, (-1, 3)), axis=1)
+        _check("wind velocity", speed, (0.0, SPEED), "m/s", "in m/s")
+
+
+def _check(name: str, values: np.ndarray, usual: tuple[float, float], unit: str, hint: str) -> None:
+    """Warns the caller's caller's caller where one of some values is not what there is."""
+    least, most = usual
+    # differences of places are rounded
+    wrong = values[(values < least * (1.0 - 1e-9)) | (values > most * (1.0 + 1e-9))]
+    if len(wrong):
+        among = f"at most {most:g}" if least == 0.0 else f"{least:g} to {most:g}"
+        unit = f" {unit}" if unit else ""
+        text = f"{name} = {wrong[0]:g}{unit}, usual is {among}{unit}: it has to be {hint}"
+        warnings.warn(text, WarpYarnWarning, stacklevel=4)
