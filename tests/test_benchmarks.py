@@ -27,6 +27,7 @@ terms_scene = load("scenes/terms.py")
 defaults = load("benchmarks/defaults.py")
 iterations = load("benchmarks/iterations.py")
 tensile = load("benchmarks/tensile_curve.py")
+coarse = load("benchmarks/coarse.py")
 motions = beside(work, "motions")
 
 
@@ -807,3 +808,23 @@ def test_the_tensile_curve_has_leaf_and_kandil_s_slope_and_then_the_yarns_own():
     assert straight[1]["force per width [N/m]"] / 1e-4 == pytest.approx(1.05 * own, rel=1e-3)
     figure = tensile.draw([{"kind": kind, **row} for kind in tensile.KINDS for row in free], (0.05, 0.05))
     assert len(figure.axes) == 2
+
+
+# -- benchmarks/coarse.py ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_coarse_cloths_come_near_the_fine_one():
+    rows = coarse.compare("handkerchief", 49, (4, 2, 1), steps=60)
+    assert [row["nodes"] for row in rows] == [169, 625, 2401]
+    for name in ("drape", "period"):
+        errors = [abs(row[f"{name} error"]) for row in rows]
+        assert errors[0] > errors[1] > errors[2] == 0.0
+    # a strip longer by half a coarse distance at the clamp: the square of its length
+    free = 40.0
+    assert rows[1]["period error"] == pytest.approx(((free + 1.0) / (free + 0.5)) ** 2 - 1.0, rel=0.15)
+    for row in rows:
+        assert abs(row["shear error"]) < 2e-4
+        assert abs(row["tension error"]) < 1e-9
+    assert rows[0]["times faster"] > 3.0
+    assert len(coarse.draw(rows).axes) == 2

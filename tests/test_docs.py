@@ -76,6 +76,16 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(path.read_text()), target
 
 
+def test_the_page_on_outlines_does_what_it_says():
+    blocks = re.findall(r"^```python\n(.+?)^```", (ROOT / "docs" / "outlines.md").read_text(), flags=re.M | re.S)
+    space: dict = {}
+    for block in blocks:
+        exec(block, space)
+    assert space["coarse"].nodes == 169
+    assert space["scene"].seams.shape == (9, 2)
+    assert space["disc"].nodes < space["frame"].nodes
+
+
 def test_the_page_on_drafts_does_what_it_says(tmp_path, monkeypatch):
     """Its code, one block after the other, on fewer yarns."""
     blocks = re.findall(r"^```python\n(.+?)^```", (ROOT / "docs" / "drafts.md").read_text(), flags=re.M | re.S)

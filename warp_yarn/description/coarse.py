@@ -80,12 +80,14 @@ def _yarns(cloth: Cloth, n: int, shares: list[np.ndarray]) -> tuple[list[Yarn], 
     own = np.concatenate([cloth.warp[middle[0]], cloth.weft[middle[1]]]).tolist()
     yarns: dict[tuple, Yarn] = {}
     # what differs by rounding alone is the same
-    keys = [(kind, *(f"{value:.9e}" for value in row)) for kind, row in zip(own, sums, strict=True)]
+    keys = [(kind, *(float(f"{value:.9e}") for value in row)) for kind, row in zip(own, sums, strict=True)]
     for key, kind, row in zip(keys, own, sums, strict=True):
         if key not in yarns:
             yarns[key] = _yarn(cloth, n, row, kind)
-    number = {key: k for k, key in enumerate(yarns)}
-    return list(yarns.values()), np.array([number[key] for key in keys])
+    # those of the edges last: yarns that name no colour have it by their place
+    first = sorted(yarns, key=lambda key: (key[-1] < n * (1.0 - 1e-9), key[0]))
+    number = {key: k for k, key in enumerate(first)}
+    return [yarns[key] for key in first], np.array([number[key] for key in keys])
 
 
 def _yarn(cloth: Cloth, n: int, total: np.ndarray, kind: int) -> Yarn:
