@@ -27,7 +27,7 @@ OVER = ("sphere", "box", "table", "torus")
 
 def parser() -> argparse.ArgumentParser:
     result = touch.parser(__doc__, "drape", rows=21, columns=21, steps=300)
-    result.add_argument("--over", choices=OVER, default="sphere", help="(%(default)s)")
+    result.add_argument("--over", choices=OVER, help="(sphere)")
     result.add_argument("--mesh", type=Path, metavar="FILE", help="over what this file has, instead")
     touch.add_positive(result, "--scale", 1.0, "metres of a unit of the file")
     return result
@@ -57,7 +57,7 @@ def obstacles(options: argparse.Namespace, length: float) -> tuple[list[Obstacle
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         middle = 0.5 * (low + high)
         return [floor, mesh.replace(position=(-middle[0], -middle[1], -low[2]))], float(high[2] - low[2])
-    if options.over == "sphere":
+    if options.over in (None, "sphere"):
         radius = 0.25 * length
         return [floor, wy.Sphere(center=(0, 0, radius), radius=radius, friction=mu)], 2.0 * radius
     if options.over == "box":
@@ -80,6 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
+    if options.mesh is not None and options.over is not None:
+        raise wy.InputError(f"--over {options.over} and --mesh {options.mesh}, must be one of both")
+    if options.mesh is None and options.scale != 1.0:
+        raise wy.InputError(f"--scale {options.scale:g} is of --mesh, which is not given")
     cloth = touch.flat(options)
     beneath, height = obstacles(options, float(np.ptp(cloth.position, axis=0).max()))
     cloth = touch.raised(cloth, height)

@@ -107,7 +107,7 @@ def test_the_page_on_drafts_does_what_it_says(tmp_path, monkeypatch):
 def test_ci_runs_the_test_command_of_the_readme():
     section = (ROOT / "README.md").read_text().split("## Test it")[1]
     command = re.search(r"```bash\n(.+)\n```", section)[1]
-    assert ".venv/bin/mypy" in command and command.endswith(".venv/bin/pytest")
+    assert ".venv/bin/mypy" in command and command.endswith(".venv/bin/pytest -n auto")
     assert command in (ROOT / ".ci" / "run").read_text().splitlines()
 
 

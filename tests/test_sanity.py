@@ -170,3 +170,22 @@ def test_a_simulator_says_what_it_was_made_with(name):
     simulator = wy.Simulator(wy.Scene(wy.paper.cloth(rows=4, columns=4)))
     with pytest.raises(wy.NoAttributeError, match=rf"simulator\.{name} cannot be set: .* make another Simulator"):
         setattr(simulator, name, getattr(simulator, name))
+
+
+def test_a_step_in_milliseconds():
+    scene = wy.Scene(wy.paper.cloth(rows=3, columns=3))
+    with pytest.warns(wy.WarpYarnWarning, match=r"step = 1 s, usual is at most 0.2 s: it has to be in seconds"):
+        wy.Simulator(scene, step=1.0)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: wy.fabrics.denim(size=10), lambda: wy.piece(wy.fabrics.denim, wy.outline.rectangle(20.0, 6.0))]
+)
+def test_sizes_in_millimetres_are_refused_before_they_fill_the_memory(make):
+    with pytest.raises(wy.InputError, match=r"rows = \d+, columns = \d+ make .* crossings, must be at most 16000000"):
+        make()
+
+
+def test_a_piece_is_of_a_fabric_and_not_of_a_cloth():
+    with pytest.raises(wy.InputError, match="must be a function that makes a Cloth"):
+        wy.piece(wy.fabrics.denim(), wy.outline.disc(0.01))

@@ -475,3 +475,12 @@ def test_pictures_on_request(usd, tmp_path):
     hang.main([*arguments, "--output", str(usd)])
     assert png.read_bytes().startswith(b"\x89PNG")
     assert b"ftyp" in mp4.read_bytes()[:16]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [("--scale 0.1", "--scale 0.1 is of --mesh"), ("--over box --mesh a.obj", "must be one of both")],
+)
+def test_options_of_drape_that_contradict_each_other(options, message):
+    with pytest.raises(wy.InputError, match=message):
+        load("scenes/drape.py").main(options.split())

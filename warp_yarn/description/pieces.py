@@ -31,6 +31,10 @@ def piece(
     Raises:
         InputError: as of ``Cloth.cut``.
     """
+    if not callable(fabric):
+        raise InputError(
+            f"fabric = {fabric!r}, must be a function that makes a Cloth, such as wy.fabrics.denim, not called"
+        )
     corners = checked_polygon("outline", outline)
     low, high = corners.min(axis=0), corners.max(axis=0)
     sample = fabric(rows=3, columns=3, **options)

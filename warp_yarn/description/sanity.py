@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import WarpYarnWarning
+from ..errors import WarpYarnWarning, real
 
 if TYPE_CHECKING:
     from .cloth import Cloth
@@ -25,6 +25,9 @@ ACCELERATION = 200.0
 """Twenty times gravity [m/s²]: in cm/s² it is 980."""
 SPEED = 350.0
 """Of wind [m/s], beyond sound: 10 m/s are 1000 cm/s."""
+
+STEP = 0.2
+"""Of time [s]: films have 24 frames a second; longer steps look for equilibrium."""
 
 
 def warn_of_units(cloth: Cloth) -> None:
@@ -75,6 +78,13 @@ def warn_of_speed(velocity: Any) -> None:
     if not callable(velocity):
         speed = np.linalg.norm(np.reshape(velocity, (-1, 3)), axis=1)
         _check("wind velocity", speed, (0.0, SPEED), "m/s", "in m/s")
+
+
+def checked_step(step: Any) -> float:
+    """Gives a time step [s], and warns where it is likely in milliseconds."""
+    checked = real("step", step, above=0.0)
+    _check("step", np.array([checked]), (0.0, STEP), "s", "in seconds: 1e-3 for a millisecond")
+    return checked
 
 
 def _check(name: str, values: np.ndarray, usual: tuple[float, float], unit: str, hint: str) -> None:

@@ -77,8 +77,9 @@ class Scene(Fixed):
         obstacles: what the cloth may touch: Plane, Sphere, Capsule, Cylinder, Box, TriangleMesh.
         self_contact: whether the cloth may touch itself; else it passes through itself.
         contact: the law of contact; None: as ``Contact()``.
-        seams: pairs of nodes that are sewn together [n, 2], of one cloth or of two, at most two of a node. They do not
-            go with self_contact, which would hold them apart.
+        seams: pairs of nodes that are sewn together [n, 2], of one cloth or of two, at most two of a node. Nodes of a
+            second cloth are those of its own, and ``nodes`` of the first more. They do not go with self_contact, which
+            would hold them apart.
         seam_stiffness: k of the spring of each pair [N/m], above 0.
         contact_force: what presses warp and weft together at a crossing: "published", eq. 3, whose stretch forces are
             those of the straight segments; "crimped", of segments that rise by the crimp of the yarns, so that a flat

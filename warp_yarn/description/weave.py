@@ -12,6 +12,9 @@ from ..errors import InputError, choice, integer
 from . import notation
 from .fixed import Fixed
 
+MOST_CROSSINGS = 16_000_000
+"""Of a cloth: it takes some 2 kB each, and a size in mm instead of m a million times as many."""
+
 
 class Weave(Fixed):
     """The draft of a cloth of rows × columns crossing nodes.
@@ -140,8 +143,13 @@ def woven(weave: Any, *, rows: int, columns: int) -> Weave:
     """Makes a weave of what a fabric may be asked for: one of ``WEAVES``, words of ``Weave.from_notation``, or a Weave.
 
     Raises:
-        InputError: it is none of these, or a Weave of other numbers of yarns.
+        InputError: it is none of these, or a Weave of other numbers of yarns; more crossings than memory could hold.
     """
+    if all(isinstance(count, int | np.integer) for count in (rows, columns)) and rows * columns > MOST_CROSSINGS:
+        text = (
+            f"rows = {rows}, columns = {columns} make {rows * columns:.3g} crossings, must be at most {MOST_CROSSINGS}"
+        )
+        raise InputError(f"{text}: sizes are in metres")
     if isinstance(weave, Weave):
         if (weave.rows, weave.columns) != (rows, columns):
             raise InputError(

@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from ..description.levels import BLOCKS
+from ..description.sanity import checked_step
 from ..description.scene import Scene
 from ..description.varying import has_gusts
 from ..errors import InputError, brief, choice, integer, real
@@ -73,7 +74,7 @@ class Model:
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {brief(scene)}, must be a Scene")
         self.scene = scene
-        self.step_size = real("step", step, above=0.0)
+        self.step_size = checked_step(step)
         self.precision = choice("precision", precision, PRECISIONS)
         chosen = defaults.preconditioner(scene, self.step_size) if preconditioner is None else preconditioner
         self.preconditioner = choice("preconditioner", chosen, PRECONDITIONERS)

@@ -191,4 +191,4 @@ def film(
         return lambda: usd.Stage(path, head, look)
     if ending in RECORDINGS:
         return lambda: recordings.recording(path, head, **written)
-    raise InputError(f"path = {str(path)!r}, must end in {', '.join((*usd.ENDINGS, *RECORDINGS))}")
+    raise InputError(f"path = {str(path)!r}, must end in {', '.join((*usd.ENDINGS, *RECORDINGS))}; movies: write_mp4")

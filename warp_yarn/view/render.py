@@ -87,7 +87,7 @@ def write_mp4(
     view: Sequence[float] = VIEW,
     camera: Camera | None = None,
     selvedge: bool = False,
-    progress: bool | None = False,
+    progress: bool | None = None,
 ) -> None:
     """Draws a trajectory as a movie (H.264), seen by a camera that stands still.
 
