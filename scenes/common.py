@@ -224,7 +224,7 @@ def pictures(
     if options.png is not None:
         writers.append(lambda: wy.write_png(options.png, trajectory if still is None else still, **picture))
     if options.mp4 is not None:
-        rate = {} if getattr(options, "fps", None) is None else {"frames_per_second": options.fps}
+        rate = {} if getattr(options, "fps", None) is None else {"fps": options.fps}
         slow = {"slowdown": options.slowdown, **rate, **picture}
         writers.append(lambda: wy.write_mp4(options.mp4, trajectory, progress=None, **slow))
     return writers

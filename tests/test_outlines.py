@@ -561,3 +561,23 @@ def test_pictures_of_a_cut_cloth_show_the_weave_to_its_edge() -> None:
     assert 0 < warp_on_top.sum() < len(edge)
     for node, top in zip(edge.tolist(), warp_on_top, strict=True):
         assert (over[node, 0] > 0.0) == top and over[node, 0] * over[node, 1] < 0.0
+
+
+def test_two_cloths_that_are_sewn_together_are_written(tmp_path: object) -> None:
+    """Every yarn of both has its curve, and both ends of the seam stay together in the file."""
+    usd = pytest.importorskip("pxr.UsdGeom")
+    stages = pytest.importorskip("pxr.Usd")
+    upper = wy.fabrics.handkerchief(rows=5, columns=6, pose="flat")
+    lower = upper.replace(pose=upper.position + np.array([0.0, 4.1e-3, 0.0]))
+    seams = [[upper.node(-1, k), upper.nodes + lower.node(0, k)] for k in range(6)]
+    trajectory = wy.Simulator(wy.Scene([upper, lower], seams=seams, pins=upper.corners("top"))).run(3)
+    wy.write_usd(tmp_path / "sewn.usda", trajectory)
+    stage = stages.Stage.Open(str(tmp_path / "sewn.usda"))
+    curves = [usd.BasisCurves(prim) for prim in stage.Traverse() if prim.IsA(usd.BasisCurves)]
+    assert sum(len(each.GetCurveVertexCountsAttr().Get()) for each in curves) == 2 * (5 + 6)
+    points = np.concatenate([np.array(each.GetPointsAttr().Get(3)) for each in curves])
+    assert np.isfinite(points).all()
+    # free ends stick out on both sides, by less than a spacing
+    assert 8.1e-3 < np.ptp(points[:, 1]) < 10.1e-3
+    pair = trajectory.position[-1][np.array(seams)]
+    assert np.linalg.norm(pair[:, 0] - pair[:, 1], axis=1).max() < 0.1e-3

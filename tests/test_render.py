@@ -22,7 +22,7 @@ def movie(tmp_path_factory):
     """Eight frames of 1 ms as a movie at a hundredth of the speed: 7 ms take 0.7 s, so 21 pictures after the first."""
     trajectory = waving(frames=8)
     path = tmp_path_factory.mktemp("movie") / "a.mp4"
-    wy.write_mp4(path, trajectory, frames_per_second=30, slowdown=100.0, size=SIZE)
+    wy.write_mp4(path, trajectory, fps=30, slowdown=100.0, size=SIZE)
     with imageio.get_reader(path) as reader:
         pictures = [reader.get_data(k) for k in range(reader.count_frames())]
         return trajectory, reader.get_meta_data(), np.array(pictures)
@@ -273,7 +273,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, write, 
         (wy.write_png, "a.png", {"size": (640, 8)}, r"size\[1\] = 8, must be a whole number, from 16 to 16384"),
         (wy.write_mp4, "a.mp4", {"size": (641, 480)}, r"size = \(641, 480\), must be even"),
         (wy.write_mp4, "a.mp4", {"slowdown": -1.0}, "slowdown = -1.0"),
-        (wy.write_mp4, "a.mp4", {"frames_per_second": 0}, "frames_per_second = 0"),
+        (wy.write_mp4, "a.mp4", {"fps": 0}, "fps = 0"),
         (wy.write_png, "a.png", {"view": (0, 0, 0)}, r"view = \(0, 0, 0\), must not be 0"),
         (wy.write_png, "a.png", {"size": (640, 16385)}, r"size\[1\] = 16385, must be a whole number, from 16 to 16384"),
         (wy.write_png, "a.png", {"camera": (0, 0, 1)}, "must be a Camera"),
@@ -343,3 +343,10 @@ def test_nothing_of_it_is_imported_before_it_is_needed(tmp_path):
     code = "import sys, warp_yarn; sys.exit(any(m in sys.modules for m in ('viser', 'imageio')))"
     # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
+
+
+def test_the_old_name_of_a_movie_s_rate(tmp_path):
+    with pytest.warns(DeprecationWarning, match="frames_per_second is fps now"):
+        wy.write_mp4(tmp_path / "a.mp4", waving(frames=2), frames_per_second=30, slowdown=100.0, size=SIZE)
+    with imageio.get_reader(tmp_path / "a.mp4") as reader:
+        assert reader.get_meta_data()["fps"] == 30

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -81,34 +82,39 @@ def write_mp4(
     path: str | os.PathLike,
     trajectory: Trajectory,
     *,
-    frames_per_second: float = 30.0,
+    fps: float = 24.0,
     slowdown: float = 10.0,
     size: Sequence[int] = (960, 720),
     view: Sequence[float] = VIEW,
     camera: Camera | None = None,
     selvedge: bool = False,
     progress: bool | None = None,
+    frames_per_second: float | None = None,
 ) -> None:
     """Draws a trajectory as a movie (H.264), seen by a camera that stands still.
 
-    Picture k shows time k / (frames_per_second · slowdown); between two frames of the trajectory every node is taken
+    Picture k shows time k / (fps · slowdown); between two frames of the trajectory every node is taken
     to move along a straight line, and every obstacle to move and turn steadily. Needs the extra ``render``. The file
     appears whole or not at all.
 
     Args:
         path: of the movie, ending in .mp4.
         trajectory: what to draw, at least one frame.
-        frames_per_second: pictures in one second of playing time, above 0.
+        fps: pictures in one second of playing time, above 0.
         slowdown: seconds of playing time for one second of simulated time, above 0.
         size: width and height in pixels, even, from 16 to 16384.
         view, camera, selvedge: as of ``write_png``; without a camera every frame is in view.
         progress: show a progress bar; None: where stderr is a terminal.
+        frames_per_second: the old name of fps.
 
     Raises:
         InputError: an argument is out of its range, the folder of `path` does not exist, or imageio is not installed.
     """
     _check_ending(path, ".mp4")
-    rate = real("frames_per_second", frames_per_second, above=0.0)
+    if frames_per_second is not None:
+        warnings.warn("write_mp4's frames_per_second is fps now", DeprecationWarning, stacklevel=2)
+        fps = frames_per_second
+    rate = real("fps", fps, above=0.0)
     apart = 1.0 / (rate * real("slowdown", slowdown, above=0.0))
     size = checked_size("size", size, movie=True)
     imageio = _extra("imageio.v2")
