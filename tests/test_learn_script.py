@@ -57,16 +57,18 @@ def test_the_animation_has_data_and_model_next_to_each_other(recording, tmp_path
     # Frames 2, 4, ..., 10, of two materials twice
     assert samples(usd) == [5] * 4
     stage = Usd.Stage.Open(str(usd))
-    assert (stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (4.0, pytest.approx(1.0 / (2e-3 * 10.0)))
+    # four times 2 ms, ten times slower, at 24 time codes a second
+    end = 4 * 2e-3 * 10.0 * 24.0
+    assert (stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (pytest.approx(end), 24.0)
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == "/comparison"
     points = {
-        name: UsdGeom.PointBased(stage.GetPrimAtPath(f"/comparison/{name}/yarn_0")).GetPointsAttr().Get(4.0)
+        name: UsdGeom.PointBased(stage.GetPrimAtPath(f"/comparison/{name}/yarn_0")).GetPointsAttr().Get(end)
         for name in ("data", "model")
     }
     # It has learned: single precision of USD, and 1 nm, at which learning ends
     np.testing.assert_allclose(points["model"], points["data"], atol=1e-7)
-    boxes = UsdGeom.BBoxCache(4.0, ["default"])
+    boxes = UsdGeom.BBoxCache(end, ["default"])
     data, model = (
         boxes.ComputeWorldBound(stage.GetPrimAtPath(f"/comparison/{name}")).ComputeAlignedRange()
         for name in ("data", "model")

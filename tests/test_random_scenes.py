@@ -7,6 +7,9 @@ from hypothesis import strategies as st
 
 import warp_yarn as wy
 
+# numbers that no fabric has are asked for
+pytestmark = pytest.mark.filterwarnings("ignore::warp_yarn.WarpYarnWarning")
+
 STEPS = 100
 
 
