@@ -73,7 +73,8 @@ def test_the_animation_has_data_and_model_next_to_each_other(recording, tmp_path
         boxes.ComputeWorldBound(stage.GetPrimAtPath(f"/comparison/{name}")).ComputeAlignedRange()
         for name in ("data", "model")
     )
-    assert model.GetMin()[0] > data.GetMax()[0] + 1e-3
+    # free ends stick out into the gap
+    assert model.GetMin()[0] > data.GetMax()[0] + 5e-4
     assert model.GetMin()[2] == pytest.approx(data.GetMin()[2], abs=1e-7)
 
 
