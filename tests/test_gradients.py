@@ -1,5 +1,6 @@
 """Gradients of whole runs against central differences, for every input that a run takes."""
 
+import inspect
 import io
 import subprocess
 import sys
@@ -376,7 +377,7 @@ def made_with(name: str, value: float) -> None:
         wy.Yarn(**{**yarn, name: value})
     elif name.startswith("wind_"):
         wy.Wind(velocity=(0.0, 5.0, 0.0), **{name.removeprefix("wind_"): value})
-    elif name in ("pin_stiffness", "seam_stiffness"):
+    elif name in inspect.signature(wy.Scene).parameters:
         wy.Scene(pinned, pins=[0], **{name: value})
     else:
         cloth(**{name: value})

@@ -1,6 +1,7 @@
 """What holds of every term there is, of one that is added too."""
 
 import dataclasses
+import inspect
 
 import pytest
 from cases import YARNS, Case, cloth, scene
@@ -49,7 +50,7 @@ def test_ranges_of_inputs_are_those_of_descriptions(name: str, end: str) -> None
             return dataclasses.replace(YARNS[0], **{name: value})
         if name.startswith("wind_"):
             return wy.Wind(velocity=(0.0, 0.0, 0.0), **{name.removeprefix("wind_"): value})
-        if name in ("pin_stiffness", "seam_stiffness"):
+        if name in inspect.signature(wy.Scene).parameters:
             return wy.Scene(cloth("plain"), **{name: value})
         return cloth("plain").replace(**{name: value})
 

@@ -128,7 +128,7 @@ class Arrays(DeclaredArrays):
         cloth = scene.cloth
         for name in YARN_PARAMETERS:
             self[name] = self.numbers([getattr(cloth.yarns[k], name) for k in cloth.material])
-        self._cloth_numbers(cloth)
+        _set_cloth_numbers(self, cloth)
         if scene.gravity is not None:
             self._vectors("gravity", scene.gravity)
         if scene.wind is not None:
@@ -166,22 +166,6 @@ class Arrays(DeclaredArrays):
         self[name] = self.numbers(rows[:1])
         if np.ndim(value) == 2:
             self[f"{name}_path"] = self.numbers(rows)
-
-    def _cloth_numbers(self, cloth: Cloth | Cloths) -> None:
-        """Fill what a cloth says in numbers: single ones, or in a general cloth those of every segment, yarn, ..."""
-        general = "general" in self.conditions
-        for name in CLOTH_NUMBERS:
-            if general and name in OF_CROSSINGS:
-                self[name] = self.numbers(cloth.at_nodes(name))
-            elif not general or name not in ("spacing", "radius"):
-                self[name] = self.numbers(getattr(cloth, name))
-        if general:
-            self["spacing"] = self.numbers(np.concatenate([cloth.node_spacing, cloth.node_widths]).ravel())
-            self["radius"] = self.numbers(np.append(cloth.halves, 1.0 + cloth.yarn_crimp))
-            self["lock_angle"] = self.numbers(cloth.corner_lock.ravel())
-        else:
-            self["lock_angle"] = self.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
-        self["lengthening"] = self.numbers(1.0 + cloth.yarn_crimp) if general else None
 
     def add_frames(self, count: int) -> None:
         """Make room for so many frames of what moves, as ``frame_position`` and so on."""
@@ -245,3 +229,20 @@ def _number_sizes(cloth: Cloth | Cloths, general: bool) -> dict[str, int]:
         "cloth crossing": topology.nodes,
     }
     return counts if general else dict.fromkeys(counts, 1)
+
+
+def _set_cloth_numbers(arrays: Arrays, cloth: Cloth | Cloths) -> None:
+    """Fill what a cloth says in numbers: single ones, or in a general cloth those of every segment, yarn, ..."""
+    general = "general" in arrays.conditions
+    for name in CLOTH_NUMBERS:
+        if general and name in OF_CROSSINGS:
+            arrays[name] = arrays.numbers(cloth.at_nodes(name))
+        elif not general or name not in ("spacing", "radius"):
+            arrays[name] = arrays.numbers(getattr(cloth, name))
+    if general:
+        arrays["spacing"] = arrays.numbers(np.concatenate([cloth.node_spacing, cloth.node_widths]).ravel())
+        arrays["radius"] = arrays.numbers(np.append(cloth.halves, 1.0 + cloth.yarn_crimp))
+        arrays["lock_angle"] = arrays.numbers(cloth.corner_lock.ravel())
+    else:
+        arrays["lock_angle"] = arrays.numbers(2.0 * np.arcsin(cloth.radius / cloth.spacing))
+    arrays["lengthening"] = arrays.numbers(1.0 + cloth.yarn_crimp) if general else None
