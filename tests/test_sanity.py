@@ -179,7 +179,14 @@ def test_a_step_in_milliseconds():
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: wy.fabrics.denim(size=10), lambda: wy.piece(wy.fabrics.denim, wy.outline.rectangle(20.0, 6.0))]
+    "make",
+    [
+        lambda: wy.fabrics.denim(size=10),
+        lambda: wy.piece(wy.fabrics.denim, wy.outline.rectangle(20.0, 6.0)),
+        lambda: wy.paper.cloth(rows=100_000, columns=100_000),
+        lambda: wy.Weave.satin(rows=5000, columns=5000),
+        lambda: wy.Weave.from_drawdown([[0, 1], [1, 0]], rows=5000, columns=5000),
+    ],
 )
 def test_sizes_in_millimetres_are_refused_before_they_fill_the_memory(make):
     with pytest.raises(wy.InputError, match=r"rows = \d+, columns = \d+ make .* crossings, must be at most 16000000"):

@@ -12,14 +12,11 @@ import numpy as np
 from ..errors import InputError, finite_array, integer
 from .cloth import Cloth
 from .fixed import Replaceable, says_why
-from .weave import Weave
+from .weave import MOST_CROSSINGS, Weave
 from .woven import OF_CROSSINGS
 
 MOST_THREADS = 10_000
 """Ends, picks, shafts and treadles."""
-
-MOST_SQUARES = 16_000_000
-"""Of a drawdown, and of a liftplan."""
 
 OF_THREADS = ("colors", "spacing", "thickness")
 """What may be known of each end and pick."""
@@ -71,8 +68,8 @@ class Draft(Replaceable):
         keep("treadling", _groups("treadling", self.treadling, treadles))
         keep("rising", bool(self.rising))
         for squares, what in ((self.ends, "ends"), (self.shafts, "shafts")):
-            if self.picks * squares > MOST_SQUARES:
-                raise InputError(f"{self.picks} picks × {squares} {what}, must be at most {MOST_SQUARES} squares")
+            if self.picks * squares > MOST_CROSSINGS:
+                raise InputError(f"{self.picks} picks × {squares} {what}, must be at most {MOST_CROSSINGS} squares")
         for thread, count in (("warp", self.ends), ("weft", self.picks)):
             for kind in OF_THREADS:
                 keep(f"{thread}_{kind}", _of_threads(f"{thread}_{kind}", getattr(self, f"{thread}_{kind}"), count))

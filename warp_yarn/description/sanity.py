@@ -25,7 +25,6 @@ ACCELERATION = 200.0
 """Twenty times gravity [m/s²]: in cm/s² it is 980."""
 SPEED = 350.0
 """Of wind [m/s], beyond sound: 10 m/s are 1000 cm/s."""
-
 STEP = 0.2
 """Of time [s]: films have 24 frames a second; longer steps look for equilibrium."""
 

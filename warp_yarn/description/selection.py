@@ -22,7 +22,8 @@ def selected_terms(scene: Scene, names: Sequence[str] | None) -> tuple[str, ...]
     known = in_order()
     missing = {name: reason for name, term in known.items() if (reason := lacks(scene, term))}
     if names is None:
-        given = {name for name, term in known.items() if any(p.name in scene.parameters for p in term.parameters)}
+        values = scene.parameters
+        given = {name for name, term in known.items() if any(p.name in values for p in term.parameters)}
         return tuple(name for name, term in known.items() if name not in missing and (own(term) or name in given))
     for name in names:
         choice("terms", name, known)

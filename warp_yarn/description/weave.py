@@ -83,9 +83,8 @@ class Weave(Fixed):
         if drawn.ndim != 2 or not drawn.size:
             raise InputError("warp_on_top must be a two-dimensional array of 0 and 1, picks × ends")
         picks, ends = drawn.shape
-        end = np.arange(integer("rows", ends if rows is None else rows, least=3)) % ends
-        pick = np.arange(integer("columns", picks if columns is None else columns, least=3)) % picks
-        return cls(drawn[np.ix_(pick, end)].T[::-1], name)
+        rows, columns = _counts(ends if rows is None else rows, picks if columns is None else columns)
+        return cls(drawn[np.ix_(np.arange(columns) % picks, np.arange(rows) % ends)].T[::-1], name)
 
     @classmethod
     def from_notation(cls, text: str, *, rows: int, columns: int) -> Weave:
@@ -132,7 +131,16 @@ class Weave(Fixed):
 
 
 def _grid(rows: int, columns: int) -> np.ndarray:
-    return np.indices((integer("rows", rows, least=3), integer("columns", columns, least=3)))
+    return np.indices(_counts(rows, columns))
+
+
+def _counts(rows: int, columns: int) -> tuple[int, int]:
+    """Gives the numbers of yarns, or an InputError before so many crossings fill the memory."""
+    rows, columns = integer("rows", rows, least=3), integer("columns", columns, least=3)
+    if rows * columns > MOST_CROSSINGS:
+        many = f"{rows * columns:.3g} crossings, must be at most {MOST_CROSSINGS}: sizes are in metres"
+        raise InputError(f"rows = {rows}, columns = {columns} make {many}")
+    return rows, columns
 
 
 WEAVES = {"plain": Weave.plain, "twill": Weave.twill, "satin": Weave.satin}
@@ -143,13 +151,8 @@ def woven(weave: Any, *, rows: int, columns: int) -> Weave:
     """Makes a weave of what a fabric may be asked for: one of ``WEAVES``, words of ``Weave.from_notation``, or a Weave.
 
     Raises:
-        InputError: it is none of these, or a Weave of other numbers of yarns; more crossings than memory could hold.
+        InputError: it is none of these, or a Weave of other numbers of yarns; more crossings than a cloth may have.
     """
-    if all(isinstance(count, int | np.integer) for count in (rows, columns)) and rows * columns > MOST_CROSSINGS:
-        text = (
-            f"rows = {rows}, columns = {columns} make {rows * columns:.3g} crossings, must be at most {MOST_CROSSINGS}"
-        )
-        raise InputError(f"{text}: sizes are in metres")
     if isinstance(weave, Weave):
         if (weave.rows, weave.columns) != (rows, columns):
             raise InputError(
