@@ -134,6 +134,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
     for part in (linear, ros2, samples):
         kernels |= vars(part.define_reversible(variant))
     kernels |= vars(limits.define_motion(variant)) | vars(newton.define_turning(variant.forward))
+    kernels |= vars(stretch.define_compression(variant.forward))
     for reports in (obstacles.define_reports, meshes.define_search, self_contact.define_limits):
         kernels |= vars(reports(variant.forward))
     for part in (
@@ -171,4 +172,5 @@ def _build_general(variant: Variant) -> dict[str, wp.Kernel]:
     kernels["update_anchor"] = friction.define_anchor(variant)
     kernels |= vars(crimped_contact.define(variant))
     kernels |= vars(ros2.define_reversible(variant)) | vars(newton.define_turning(variant.forward))
+    kernels |= vars(stretch.define_compression(variant.forward))
     return kernels

@@ -81,6 +81,30 @@ def solve(simulator: wy.Simulator, force: np.ndarray) -> np.ndarray:
     return numbers(simulator, "solution")
 
 
+def solve_beside(
+    simulator: wy.Simulator, rhs: np.ndarray, euler_rhs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None, bool]:
+    """Solves (M + h² H − G) w = b at the present state with the method's conjugate gradient: w of positions and of
+    (u, v), and whether yarns are compressed and that was positive definite."""
+    simulator.system(weights=(1.0, 0.0, simulator.step_size**2))
+    compression = simulator.integrator.newton.compression
+    put(simulator, "rhs", rhs)
+    if euler_rhs is not None and simulator.scene.sliding:
+        put(simulator, "euler_rhs", euler_rhs.ravel())
+    simulator.model.factorize()
+    compression.find()
+
+    def solve() -> None:
+        simulator.arrays.zero("solution", "euler_solution")
+        simulator.model.solve()
+
+    with simulator.model.threads.at_hand():
+        compression.solve(solve)
+    along = numbers(simulator, "euler_solution")
+    seen = bool(numbers(simulator, "compressed")[0])
+    return numbers(simulator, "solution"), None if along is None else along.reshape(-1, 2), seen
+
+
 # -- contact ----------------------------------------------------------------------------------------------------------
 
 

@@ -16,17 +16,22 @@ from .variant import Variant
 def structs(variant: Variant) -> SimpleNamespace:
     """Make the structs of a variant."""
     scalar, vec3, mat33, sym33 = variant.scalar, variant.vec3, variant.mat33, variant.sym33
-    quat = variant.quat
+    quat, vec4 = variant.quat, variant.vec4
 
     @wp.struct
     class BlockMatrix:
         """The matrix (``linear/block_matrix.py`` tells its layout), what M, D and H are multiplied by in it, and how
-        many evaluations there were in the stage: where Newton's iteration goes to and fro, terms fill it otherwise."""
+        many evaluations there were in the stage: where Newton's iteration goes to and fro, terms fill it otherwise.
+        And what compressed yarns take from it, where that is asked for (``linear/beside.py``)."""
 
         stencil: int
         neighbour: wp.array(dtype=int)
         coefficients: wp.array(dtype=vec3)
         evaluations: wp.array(dtype=int)
+        compressed: wp.array(dtype=int)
+        indefinite: wp.array(dtype=int)
+        compression: wp.array(dtype=vec4)
+        before: wp.array(dtype=int)
         diagonal_xx: wp.array(dtype=mat33)
         diagonal_xs: wp.array(dtype=vec3)
         diagonal_ss: wp.array(dtype=scalar)
@@ -77,6 +82,7 @@ def structs(variant: Variant) -> SimpleNamespace:
         last_norm: wp.array(dtype=scalar)
         contraction: wp.array(dtype=scalar)
         kinetic: wp.array(dtype=scalar)
+        kinetic_left: wp.array(dtype=scalar)
         change: wp.array(dtype=scalar)
         first_change: wp.array(dtype=scalar)
         directional_derivative: wp.array(dtype=scalar)
@@ -88,6 +94,7 @@ def structs(variant: Variant) -> SimpleNamespace:
         take_unchecked_step: wp.array(dtype=int)
         new_direction: wp.array(dtype=int)
         rebuild_matrix: wp.array(dtype=int)
+        asks_for_compression: wp.array(dtype=int)
         newton_iterations: wp.array(dtype=int)
 
     @wp.struct

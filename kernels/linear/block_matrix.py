@@ -25,6 +25,7 @@ from ..core import memory
 from ..core.status import NOT_CONVERGED, NOT_FINITE
 from ..core.structs import structs
 from ..core.variant import Variant
+from . import beside
 
 UPPER = """
     row a = {}, b = {}, c = {}, x_s = {}, u_x = {}, v_x = {};
@@ -111,6 +112,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     vec5 = wp.types.vector(5, scalar)
     load, store = memory.functions(variant).load, memory.functions(variant).store
     BlockMatrix, SolveReport = structs(variant).BlockMatrix, structs(variant).SolveReport
+    takes_compression = beside.functions(variant).takes_compression
 
     @wp.func
     def times(m: mat33, x: vec3) -> vec3:
@@ -189,13 +191,19 @@ def functions(variant: Variant) -> SimpleNamespace:
         return tolerance[0] * tolerance[0] * size
 
     @wp.func
-    def write_report(count: int, rz: scalar, size: scalar, limit: scalar, report: SolveReport) -> bool:
+    def write_report(
+        count: int, rz: scalar, size: scalar, limit: scalar, blocks: BlockMatrix, report: SolveReport
+    ) -> bool:
         """Write how the iteration ended, unless a step before has failed; return whether it failed itself."""
         if report.status[0] != 0:
             return False
         report.iterations[0] = count
         report.residual[0] = wp.sqrt(wp.max(rz, scalar(0.0)) / wp.max(size, scalar(1.0e-30)))
         if rz <= limit:
+            return False
+        if takes_compression(blocks):
+            # A − G need not be positive definite, and who asked for it takes A then
+            blocks.indefinite[0] = 1
             return False
         report.status[0] = wp.where(wp.isfinite(rz), wp.static(NOT_CONVERGED), wp.static(NOT_FINITE))
         return True
@@ -322,7 +330,7 @@ def define(variant: Variant) -> SimpleNamespace:
                         work.p_s[s] = inverse_s[s] * work.r_s[s] + work.p_s[s] * beta
             count += 1
 
-        if write_report(count, rz, size, limit, report):
+        if write_report(count, rz, size, limit, blocks, report):
             worst = scalar(-1.0)
             for i in range(nodes):
                 here = wp.dot(work.r_x[i], wp.cw_mul(inverse_x[i], work.r_x[i]))

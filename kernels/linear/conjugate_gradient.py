@@ -22,9 +22,8 @@ import warp as wp
 from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
-from . import block_matrix, incomplete_cholesky, pair_blocks
+from . import beside, block_matrix, incomplete_cholesky
 from . import threads as synchronization
-from .pair_blocks import PAIRS_TOUCH
 from .threads import barrier, begin_solve, ended, keep_pace, partition, wait_for_solve
 
 
@@ -39,7 +38,7 @@ def define(variant: Variant) -> SimpleNamespace:
     limit_of, write_report = shared.limit_of, shared.write_report
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
     SolveReport, Pairs = structs(variant).SolveReport, structs(variant).Pairs
-    add_pairs = pair_blocks.functions(variant).add_pairs
+    has_more, add_beside = beside.functions(variant).has_more, beside.functions(variant).add_beside
     symmetric, product = (
         incomplete_cholesky.functions(variant).symmetric,
         incomplete_cholesky.functions(variant).product,
@@ -225,12 +224,12 @@ def define(variant: Variant) -> SimpleNamespace:
                         store(work.p_s, s, zero)
                         start += load(euler_solution, s) * load(euler_solution, s)
             start = total(start, 0, thread, threads, arrived, signals, work.sums)
-            pairs_touch = pairs.touching[wp.static(PAIRS_TOUCH)] != 0
-            if pairs_touch and start != zero:
-                # r = b − C x, the rest of A comes with the sweep
+            more = has_more(blocks, pairs)
+            if more and start != zero:
+                # r = b − (C − G) x, the rest of A comes with the sweep
                 for i in range(begin, end):
                     store(work.q_x, i, vec3())
-                unused = add_pairs(pairs, begin, end, solution, work.q_x)
+                unused = add_beside(blocks, pairs, begin, end, solution, work.q_x)
                 for i in range(begin, end):
                     store(work.r_x, i, load(work.r_x, i) - load(work.q_x, i))
                 arrived += threads
@@ -300,10 +299,10 @@ def define(variant: Variant) -> SimpleNamespace:
                 curvature = total(curvature, 3, thread, threads, arrived + threads, signals, work.sums)
                 swept += rows
                 arrived += threads
-                if pairs_touch:
+                if more:
                     arrived += threads
-                    of_pairs = add_pairs(pairs, begin, end, work.t_x, work.q_x)
-                    curvature += total(of_pairs, 2, thread, threads, arrived, signals, work.sums)
+                    of_more = add_beside(blocks, pairs, begin, end, work.t_x, work.q_x)
+                    curvature += total(of_more, 2, thread, threads, arrived, signals, work.sums)
                 if not (curvature > zero):
                     # past the attainable accuracy, or not finite
                     break
@@ -320,7 +319,7 @@ def define(variant: Variant) -> SimpleNamespace:
             if threads > 1:
                 barrier(signals, arrived + threads)
             if thread == 0:
-                if write_report(count, rz, size, limit, report):
+                if write_report(count, rz, size, limit, blocks, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
                         here = wp.dot(load(work.r_x, i), product(load(inverse_pivot, i), load(work.r_x, i)))

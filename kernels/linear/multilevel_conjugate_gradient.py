@@ -8,9 +8,8 @@ import warp as wp
 from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
-from . import block_matrix, incomplete_cholesky, multilevel, pair_blocks
+from . import beside, block_matrix, incomplete_cholesky, multilevel
 from . import threads as synchronization
-from .pair_blocks import PAIRS_TOUCH
 from .threads import barrier, begin_solve, partition, wait_for_solve
 
 _ROW = (
@@ -85,7 +84,7 @@ def define(variant: Variant) -> SimpleNamespace:
     precondition, barriers = multilevel.functions(variant).precondition, multilevel.functions(variant).barriers
     BlockMatrix, SolverWork = structs(variant).BlockMatrix, structs(variant).SolverWork
     SolveReport, Levels, Pairs = structs(variant).SolveReport, structs(variant).Levels, structs(variant).Pairs
-    add_pairs = pair_blocks.functions(variant).add_pairs
+    has_more, add_beside = beside.functions(variant).has_more, beside.functions(variant).add_beside
     module = variant.module("multilevel")
     variant.fuse("multilevel")
 
@@ -145,13 +144,13 @@ def define(variant: Variant) -> SimpleNamespace:
                     break
             arrived = signals[5]
             unused = zero
-            pairs_touch = pairs.touching[wp.static(PAIRS_TOUCH)] != 0
+            more = has_more(blocks, pairs)
             for i in range(begin, end):
                 unused += multiply_row(
                     i, blocks, levels.lower, solution, euler_solution, work.q_x, work.q_s,
                 )  # fmt: skip
-                if pairs_touch:
-                    unused += add_pairs(pairs, i, i + 1, solution, work.q_x)
+                if more:
+                    unused += add_beside(blocks, pairs, i, i + 1, solution, work.q_x)
                 r = load(rhs, i) - load(work.q_x, i)
                 store(work.r_x, i, r)
                 store(work.p_x, i, vec3())
@@ -181,8 +180,8 @@ def define(variant: Variant) -> SimpleNamespace:
                     curvature += multiply_row(
                         i, blocks, levels.lower, work.p_x, work.p_s, work.q_x, work.q_s,
                     )  # fmt: skip
-                    if pairs_touch:
-                        curvature += add_pairs(pairs, i, i + 1, work.p_x, work.q_x)
+                    if more:
+                        curvature += add_beside(blocks, pairs, i, i + 1, work.p_x, work.q_x)
                 arrived += threads
                 curvature = total(curvature, 1, thread, threads, arrived, signals, work.sums)
                 if not (curvature > zero):
@@ -209,7 +208,7 @@ def define(variant: Variant) -> SimpleNamespace:
             if threads > 1:
                 barrier(signals, arrived + threads)
             if thread == 0:
-                if write_report(count, rz, size, limit, report):
+                if write_report(count, rz, size, limit, blocks, report):
                     worst = scalar(-1.0)
                     for i in range(nodes):
                         here = wp.dot(load(work.r_x, i), load(work.t_x, i))

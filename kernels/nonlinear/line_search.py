@@ -60,10 +60,11 @@ def define(variant: Variant) -> SimpleNamespace:
         base_euler_velocity: wp.array(dtype=scalar),
         control: NewtonControl,
     ):
-        """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, and of the change of velocity
-        g = w + δ − v₀ that it leads to, g·M g."""
+        """Begins a line search along δ: a full step first, r·δ, how fast r falls along δ, δ·M δ, and of the change of
+        velocity g = w + δ − v₀ that it leads to, g·M g."""
         total = scalar(0.0)
         square = scalar(0.0)
+        left = scalar(0.0)
         for i in range(nodes):
             d = load(direction, i)
             total += wp.dot(load(rhs, i), d)
@@ -71,15 +72,19 @@ def define(variant: Variant) -> SimpleNamespace:
             if is_free[i] != 0:
                 gain = load(solution, i) + d - load(base_velocity, i)
             along = scalar(0.0)
+            along_left = scalar(0.0)
             if wp.static(sliding):
                 for s in range(2 * i, 2 * i + 2):
                     d_s = load(euler_direction, s)
                     total += load(euler_rhs, s) * d_s
                     gain_s = load(euler_solution, s) + d_s - load(base_euler_velocity, s)
                     along += scalar(0.5) * gain_s * gain_s
+                    along_left += scalar(0.5) * d_s * d_s
             square += load(node_mass, i) * (wp.dot(gain, gain) + along)
+            left += load(node_mass, i) * (wp.dot(d, d) + along_left)
         control.directional_derivative[0] = total
         control.kinetic[0] = square
+        control.kinetic_left[0] = left
         control.step_length[0] = scalar(1.0)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -9,7 +9,7 @@ the distance that it covers, stretches as that distance does, its crimp held: w 
 
 In (l, Δs), l = |x_b − x_a|, the energy is kₛ (l − Δs)²/(2Δs), jointly convex for Δs > 0. The matrix is its exact
 positive semi-definite part: (kₛ/Δs) g gᵀ with g = (−t, |w|; t, −|w|), and the transverse stiffness kₛ(|w|−1)/l,
-which is dropped where the yarn is slack.
+which is dropped where the yarn is slack (``linear/beside.py`` has it back).
 """
 
 import functools
@@ -117,6 +117,45 @@ def define(variant: Variant) -> wp.Kernel:
                 wp.atomic_add(blocks.upper_ss, 4 * a + direction, -ss)
 
     return stretch_term
+
+
+def define_compression(variant: Variant) -> SimpleNamespace:
+    """Define what finds the transverse stiffness that the matrix leaves out (``linear/beside.py``)."""
+    scalar, vec3, vec4, of_each = variant.scalar, variant.vec3, variant.vec4, variant.general
+    stretch_stiffness = functions(variant).stiffness
+    own, longer = general.functions(variant).own, general.functions(variant).longer
+
+    @wp.kernel(module=variant.module("stage"), enable_backward=False)
+    def find_compression(
+        segments: wp.array(dtype=wp.vec4i),
+        stretch: wp.array(dtype=scalar),
+        radius: wp.array(dtype=scalar),
+        position: wp.array(dtype=vec3),
+        euler: wp.array(dtype=scalar),
+        coefficients: wp.array(dtype=vec3),
+        compression: wp.array(dtype=vec4),
+        compressed: wp.array(dtype=int),
+    ):
+        """Find (t, g) of every segment, g = 0 of one that is not compressed, and whether any is."""
+        a, b, sa, sb, yarn, _direction = ends(segments, index(wp.tid()))
+        rest = euler[sb] - euler[sa]
+        d = position[b] - position[a]
+        half_width = radius[own(2 * yarn)]
+        half_thickness = half_width
+        along = coefficients[0][2] / rest
+        if wp.static(of_each):
+            half_thickness = radius[2 * yarn + 1]
+            d *= longer(radius, yarn)
+            along *= longer(radius, yarn) * longer(radius, yarn)
+        along *= stretch_stiffness(stretch[yarn], half_width, half_thickness)
+        ratio = wp.length(d) / rest
+        g = along * wp.max(scalar(1.0) - ratio, scalar(0.0)) / wp.max(ratio, scalar(1.0e-12))
+        t = wp.normalize(d)
+        compression[sa] = vec4(t[0], t[1], t[2], g)
+        if g > scalar(0.0):
+            compressed[0] = 1
+
+    return SimpleNamespace(find_compression=find_compression)
 
 
 def define_energy(variant: Variant) -> wp.Kernel:

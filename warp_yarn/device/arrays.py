@@ -77,7 +77,7 @@ class Arrays(DeclaredArrays):
         super().__init__(variant, device, conditions(scene, variant, self.terms), sizes, dims)
         self._topology(scene.cloth)
         self._parameters(scene)
-        for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY):
+        for group in (declarations.STATE, declarations.STEP, declarations.ASSEMBLY, declarations.COMPRESSION):
             self.make(group)
         contact.set_arrays(self)
         crimp.set_arrays(self)

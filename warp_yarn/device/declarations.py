@@ -211,6 +211,7 @@ NEWTON_WORKSPACE: Group = {
     "residual_norm": Field("world", 1, "scalar", "√J", "always", "‖r‖, and ‖ρ‖ of an adjoint solve"),
     "directional_derivative": Field("world", 1, "scalar", "J", "always", "r·δ"),
     "kinetic": Field("world", 1, "scalar", "J", "always", "g·M g of the change of velocity g"),
+    "kinetic_left": Field("world", 1, "scalar", "J", "always", "δ·M δ"),
     "last_norm": Field("world", 1, "scalar", "√J", "always", "‖δ‖ of the last step"),
     "change": Field("world", 1, "scalar", "√J", "always", "of velocities in the stage, or the first one's"),
     "first_change": Field("world", 1, "scalar", "√J", "always", "the first one's"),
@@ -223,9 +224,18 @@ NEWTON_WORKSPACE: Group = {
     "take_unchecked_step": Field("world", 1, "int", "", "always", "whether the step along δ ends the stage"),
     "new_direction": Field("world", 1, "int", "", "always", "whether to solve for another δ"),
     "rebuild_matrix": Field("world", 1, "int", "", "always", "whether the next evaluation brings a matrix along"),
+    "asks_for_compression": Field("world", 1, "int", "", "always", "whether the next solve takes along what compressed yarns take from A"),
     "order_would_be_lost": Field("world", 1, "int", "", "always", "whether crossings would pass at the start"),
 }
 """Of implicit stages and Newton's iteration."""
+
+COMPRESSION: Group = {
+    "compressed": Field("world", 1, "int", "", "Newton's iteration", "whether solves are of A − G"),
+    "indefinite": Field("world", 1, "int", "", "Newton's iteration", "whether one found that not to be positive definite"),
+    "compression": Field("node", 2, "vec4", "", "Newton's iteration", "(t, g [kg]) of the segments behind a node"),
+    "before": Field("node", 2, "int", "", "Newton's iteration", "the node before a node on its warp and weft yarn, or -1"),
+}
+"""Of what compressed yarns take from the matrix (``kernels/linear/beside.py``)."""
 
 ERROR_ESTIMATE: Group = {
     "predicted": Field("node", 1, "vec3", "m/s", "always", "w₂ that the first stage's acceleration leads to"),
@@ -336,6 +346,7 @@ GROUPS: dict[str, Group] = {
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,
+    "Compression": COMPRESSION,
     "ErrorEstimate": ERROR_ESTIMATE,
     "EnergyWatch": ENERGY_WATCH,
     "OuterForces": OUTER_FORCES,

@@ -74,7 +74,7 @@ class DeclaredArrays(collections.UserDict[str, Any]):
     def make(self, group: Group) -> None:
         """Make the arrays of a group, of 0; those that are there stay, and None stands for what the scene has not."""
         for name in group:
-            if name not in self:
+            if self.get(name) is None:
                 self[name] = self.new(name)
 
     def new(self, name: str) -> wp.array | None:

@@ -6,6 +6,7 @@ import warp as wp
 
 from ..device import declarations
 from ..device.model import Model
+from .compression import Compression
 
 INNER_TOLERANCE = 1e-2
 """Of the linear solves within Newton's iteration: A is not the exact derivative, so that more digits of its solution
@@ -29,6 +30,7 @@ class Newton:
         self.model, self.has_fallback = model, has_fallback
         a = model.arrays
         a.make(declarations.STAGES)
+        self.compression = Compression(model)
         if "base_position" not in a:  # two methods may work on one model, one after the other
             a.make(declarations.NEWTON_WORKSPACE)
             a.put("unit", 1.0)
@@ -53,7 +55,8 @@ class Newton:
         from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
         turn."""
         a = self.model.arrays
-        a.zero("evaluations", "steps", "direction", "euler_direction")
+        a.zero("evaluations", "steps", "direction", "euler_direction", "asks_for_compression")
+        self.compression.forget()
         if self.model.scene.sliding:
             a.zero("order_would_be_lost")
             self.model.launch("check_initial_guess", "segments")
@@ -103,15 +106,22 @@ class Newton:
         self._control()
 
     def solve_direction(self, stage: int) -> None:
-        """Solves for δ, from A δ = r."""
+        """Solves for δ, from A δ = r, or from (A − G) δ = r where convergence was slow."""
         a = self.model.arrays
-        a.zero("direction", "euler_direction")
-        if not len(self.model.scene.pins):
-            self.model.launch("start_rigid", 1)
         self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
-        self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])
+        wp.capture_if(a["asks_for_compression"], on_true=self.compression.find)
+        self.compression.solve(self._solve_linear)
+        self.compression.forget()
+        a.zero("asks_for_compression")
         self.model.launch("begin_line_search", 1)
         if self.model.scene.sliding:
             self.model.launch("limit_step_length", "segments")
         self.model.contact.limit_step()
         self.model.launch("check_convergence", 1, stage=stage)
+
+    def _solve_linear(self) -> None:
+        a = self.model.arrays
+        a.zero("direction", "euler_direction")
+        if not len(self.model.scene.pins):
+            self.model.launch("start_rigid", 1)
+        self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])

@@ -51,7 +51,7 @@ class StageAdjoint:
             model.update_anchor("euler_next", "anchor_next")
         with self.pin_tape:
             model.set_pin_velocity(position=a["base_position"])
-        self._stage = StageSolve(model, self.tape, tolerance)
+        self._stage = StageSolve(model, method.newton.compression, self.tape, tolerance)
 
     def _run(self, part: Callable[[], None]) -> None:
         """Launches a part of the step."""
@@ -118,6 +118,7 @@ class StageAdjoint:
         self.model.launch("enter_stage", "nodes")
         self.method.newton.assemble(matrix=True)
         self.model.factorize()
+        self.method.newton.compression.find()
 
     def _solve(self) -> None:
         """Solve for λ, and add its share of the adjoints of q₀ and v₀."""

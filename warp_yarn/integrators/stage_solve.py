@@ -11,6 +11,7 @@ from ..device.declared import arrays_of
 from ..device.graphs import GraphCache
 from ..device.model import BETWEEN, Model
 from ..kernels.core.status import STALLED
+from .compression import Compression
 from .gmres import gmres
 
 STATE = ("position", "euler", "velocity", "euler_velocity")
@@ -26,12 +27,13 @@ class StageSolve:
 
     Args:
         model: the model.
+        compression: what compressed yarns take from its matrix.
         tape: what the stage's assembly reverses.
         tolerance: of ‖ρ‖, relative to its start.
     """
 
-    def __init__(self, model: Model, tape: wp.Tape, tolerance: float):
-        self.model, self.tape, self._tolerance = model, tape, tolerance
+    def __init__(self, model: Model, compression: Compression, tape: wp.Tape, tolerance: float):
+        self.model, self._compression, self.tape, self._tolerance = model, compression, tape, tolerance
         self._graphs = GraphCache(model.device)
         self._added = self._arrays_added_to()
 
@@ -141,6 +143,9 @@ class StageSolve:
         self.model.launch("stage_adjoint_residual", "nodes")
 
     def _solve_part(self) -> None:
+        self._compression.solve(self._solve_linear)
+
+    def _solve_linear(self) -> None:
         a = self.model.arrays
         a.zero_grad("rhs", "euler_rhs")
         part = {"solution": a["rhs"].grad, "euler_solution": a.find("euler_rhs_grad")}
