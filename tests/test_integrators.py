@@ -221,10 +221,10 @@ def test_the_default_tolerance_follows_the_error_of_the_step() -> None:
     def tolerance(step: float, **options: object) -> float:
         return newton_tolerance(wy.Simulator(wy.Scene(fabric), step=step, **options), step)
 
-    assert tolerance(4.001 * wave) == 2e-2
-    assert tolerance(wave) == pytest.approx(2e-2 / 16, rel=1e-12)
-    assert tolerance(100.0 * fastest) == pytest.approx(2e-2 * np.sqrt(1e3) / 100.0, rel=1e-12)
-    assert tolerance(1.0) == 2e-4 and tolerance(1.0, precision="single") == 2e-3
+    assert tolerance(4.001 * wave) == 2e-3
+    assert tolerance(wave) == pytest.approx(2e-3 / 16, rel=1e-12)
+    assert tolerance(100.0 * fastest) == pytest.approx(2e-3 * np.sqrt(1e3) / 100.0, rel=1e-12)
+    assert tolerance(1.0) == 2e-5 and tolerance(1.0, precision="single") == 2e-3
     assert tolerance(1e-9) == tolerance(wave, differentiable=True) == 1e-8
     assert tolerance(wave, precision="single") == 2e-2
 

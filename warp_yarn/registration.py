@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from .description.selection import checked_parameter
-from .device.declarations import ASSEMBLY, FIELDS, INPUTS, PARAMETERS, STATE, TOPOLOGY
+from .device.declarations import ASSEMBLY, COMPRESSION, FIELDS, INPUTS, PARAMETERS, STATE, TOPOLOGY
 from .device.declared import arguments
 from .device.exclusive import ALONE
 from .errors import InputError, choice, integer, real
@@ -36,7 +36,7 @@ OF_STEPS |= {"gust"}
 """What becomes an input of a step."""
 OF_THE_SYSTEM = {"rhs", "euler_rhs", "solution", "euler_solution"}
 """What is made of what all terms write."""
-FOR_TERMS = {*TOPOLOGY, *PARAMETERS, *INPUTS, *STATE, *ASSEMBLY, "coefficients"}
+FOR_TERMS = {*TOPOLOGY, *PARAMETERS, *INPUTS, *STATE, *ASSEMBLY, *COMPRESSION, "coefficients"}
 FOR_TERMS |= {"evaluations", "energy", "matrix", "add_contact_load"}
 FOR_TERMS -= OF_FRICTION | OF_STEPS | OF_THE_SYSTEM
 """What kernels of a term from outside the package may take, beside their parameters."""

@@ -6,9 +6,9 @@ C is of nodes that touch (``pair_blocks.py``). G is what compressed yarns take f
 
     g (I − t tᵀ)(x_a − x_b) at a, the opposite at b, of every segment a, b,   g = η² kₛ (1 − |w|)/l > 0
 
-A compressed yarn pushes its nodes out of its line. A leaves that out, so as to be positive definite whatever the state
-(``terms/stretch.py``). Near a minimum of a stage's energy A − G is positive definite too, and Newton's iteration with it
-converges fast where that with A goes on by a steady factor: wherever yarns are buckled.
+A compressed yarn pushes its nodes out of its line. A leaves that out, so as to be positive definite whatever the
+state (``terms/stretch.py``). Near a minimum of a stage's energy A − G is positive definite too, and Newton's iteration
+with it converges fast where that with A goes on by a steady factor: wherever yarns are buckled.
 """
 
 import functools

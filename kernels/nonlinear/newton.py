@@ -34,9 +34,9 @@ nothing, and where A − G is indefinite a solve that is begun twice (0 to 2 % o
 CONTRACTION_SAFETY = 4.0
 """What a step of the iteration leaves is taken to be so many times what the contraction before it says."""
 STEADY_CONTRACTION = 0.97
-"""The most that is believed of what touches. Impacts buckle yarns, which A does not see: steps then fall by a steady
-factor, and all that are still to come add up to a geometric series. To go on until rounding ends it took a quarter of
-all iterations at 1e-8."""
+"""The most that is believed. Where A − G is indefinite, and by friction, which is not symmetric, steps fall by a steady
+factor, and all that are still to come add up to a geometric series. To go on until rounding ends it took three quarters
+of all iterations of a cloth that was let go from 15 % stretch."""
 LEAST_CONTRACTION = 1e-3
 """The least contraction that is believed: a cloth that moves as one is solved at once, and what comes next is not."""
 REBUILDING_TURN = 0.03

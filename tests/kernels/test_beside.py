@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 from internals import solve_beside
-from warp_yarn.presets.fabrics import FABRICS
 
 import warp_yarn as wy
+from warp_yarn.presets.fabrics import FABRICS
 
 STIFFEST = 0.5
 """Of h, in times that a stretch wave takes from a crossing to the next: inertia is what keeps the matrix definite."""

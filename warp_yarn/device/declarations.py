@@ -224,16 +224,16 @@ NEWTON_WORKSPACE: Group = {
     "take_unchecked_step": Field("world", 1, "int", "", "always", "whether the step along δ ends the stage"),
     "new_direction": Field("world", 1, "int", "", "always", "whether to solve for another δ"),
     "rebuild_matrix": Field("world", 1, "int", "", "always", "whether the next evaluation brings a matrix along"),
-    "asks_for_compression": Field("world", 1, "int", "", "always", "whether the next solve takes along what compressed yarns take from A"),
+    "asks_for_compression": Field("world", 1, "int", "", "always", "whether the next solve sees what is compressed"),
     "order_would_be_lost": Field("world", 1, "int", "", "always", "whether crossings would pass at the start"),
 }
 """Of implicit stages and Newton's iteration."""
 
 COMPRESSION: Group = {
     "compressed": Field("world", 1, "int", "", "Newton's iteration", "whether solves are of A − G"),
-    "indefinite": Field("world", 1, "int", "", "Newton's iteration", "whether one found that not to be positive definite"),
+    "indefinite": Field("world", 1, "int", "", "Newton's iteration", "whether one found that to be indefinite"),
     "compression": Field("node", 2, "vec4", "", "Newton's iteration", "(t, g [kg]) of the segments behind a node"),
-    "before": Field("node", 2, "int", "", "Newton's iteration", "the node before a node on its warp and weft yarn, or -1"),
+    "before": Field("node", 2, "int", "", "Newton's iteration", "the node before on its warp and weft yarn, or -1"),
 }
 """Of what compressed yarns take from the matrix (``kernels/linear/beside.py``)."""
 
