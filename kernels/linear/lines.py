@@ -89,10 +89,17 @@ FETCH
     clear(inverse);
     for (int e = begin; e < end; ++e) {
         const int i = node.data[e];
-        SCALAR* g = factor.data + (size_t)e * 8 * K;
+        SCALAR* g = factor.data + (size_t)e * SIZE;
         SCALAR* inv = g + 4 * K;
         is_free(i, free);
         diagonal(i, own);
+        SCALAR across[4] = {0, 0, 0, 0}, slides[3] = {0, 0, 0};
+#if K == 4
+        other_rate(i, free[0], across, slides);
+#endif
+        for (int k = 0; k < 3; ++k)
+            for (int j = 0; j < 3; ++j)
+                own[k][j] -= slides[k] * across[j];
         for (int k = 0; k < K; ++k)
             if (free[k] == 0) {
                 for (int j = 0; j < K; ++j)
@@ -131,9 +138,15 @@ FETCH
             for (int j = 0; j < K; ++j)
                 pivot[k][j] = line[k][j] - taken[k][j];
         clear(inverse);
-        SCALAR half = 0.5;
-        if (!invert(pivot, K, inverse)) {
-            half = 0;
+        SCALAR half = K == 4 ? 0.25 : 0.5;
+        const bool safe = invert(pivot, K, inverse);
+        for (int k = 0; k < 3; ++k)
+            for (int j = 0; j < 3; ++j) {
+                own[k][j] += slides[k] * across[j];
+                line[k][j] += slides[k] * across[j];
+            }
+        if (!safe) {
+            half = across[0] = across[1] = across[2] = 0;
             if (!invert(own, K, inverse))
                 clear(inverse);
         }
@@ -156,6 +169,8 @@ FETCH
                 g[4 * j + k] = k < K ? gain[k][j] : 0;
                 inv[4 * j + k] = k < K ? inverse[k][j] : 0;
             }
+        for (int k = 8 * K; k < SIZE; ++k)
+            g[k] = across[k - 8 * K];
         upper(i, direction, next);
         for (int k = 0; k < K; ++k)
             free_before[k] = free[k];
@@ -176,6 +191,19 @@ _FETCH_NODES = """
         m[3][3] = blocks.diagonal_ss.data[2 * i + direction];
 #endif
     };
+#if SLIDING
+    auto other_rate = [&](int i, SCALAR free, SCALAR* across, SCALAR* slides) {
+        const int o = 2 * i + 1 - direction;
+        const SCALAR d = blocks.diagonal_ss.data[o];
+        if (is_crossing.data[i] == 0 || !(d > 0))
+            return;
+        across[3] = 1 / d;
+        for (int k = 0; k < 3; ++k) {
+            slides[k] = free * blocks.diagonal_xs.data[o].c[k];
+            across[k] = slides[k] / d;
+        }
+    };
+#endif
     auto upper = [&](int i, int slot, block& m) {
         if (slot >= blocks.stencil || blocks.neighbour.data[blocks.stencil * i + slot] < 0) {
             clear(m);
@@ -207,18 +235,20 @@ _FETCH_COARSE = """
 """
 _SOLVE = """
     auto vector = [&](int i) {
-#if K == 4
-        return row{r_x.data[i].c[0], r_x.data[i].c[1], r_x.data[i].c[2], r_s.data[2 * i + direction]};
-#else
         return row{r_x.data[i].c[0], r_x.data[i].c[1], r_x.data[i].c[2], 0};
-#endif
     };
     auto column = [](const SCALAR* m, int k) { return *(const row*)(m + 4 * k); };
     // y ← (I + G)⁻¹ r
     row y = {};
     for (int e = begin; e < end; ++e) {
-        const SCALAR* g = factor.data + (size_t)e * 8 * K;
-        row a = vector(node.data[e]) - column(g, 0) * y[0];
+        const int i = node.data[e];
+        const SCALAR* g = factor.data + (size_t)e * SIZE;
+        row r = vector(i);
+#if K == 4
+        r = r - column(g, 8) * r_s.data[2 * i + 1 - direction];
+        r[3] = r_s.data[2 * i + direction];
+#endif
+        row a = r - column(g, 0) * y[0];
         row b = column(g, 1) * y[1];
         a = a - column(g, 2) * y[2];
 #if K == 4
@@ -230,7 +260,7 @@ _SOLVE = """
     // z += (I + G)⁻ᵀ E⁻¹ y
     row x = {};
     for (int e = end - 1; e >= begin; --e) {
-        const SCALAR* inv = factor.data + (size_t)e * 8 * K + 4 * K;
+        const SCALAR* inv = factor.data + (size_t)e * SIZE + 4 * K;
         const row own = *(const row*)(work.data + 4 * (size_t)e);
         row a = column(inv, 0) * own[0] + column(inv, 1) * own[1];
         row b = column(inv, 2) * own[2];
@@ -239,7 +269,7 @@ _SOLVE = """
 #endif
         if (e + 1 < end) {
             // Gᵀ of the node behind
-            const SCALAR* g = factor.data + (size_t)(e + 1) * 8 * K;
+            const SCALAR* g = factor.data + (size_t)(e + 1) * SIZE;
             const row p0 = column(g, 0) * x, p1 = column(g, 1) * x, p2 = column(g, 2) * x;
             auto sum = [](row p) { return p[0] + p[1] + p[2] + p[3]; };
             row taken = {sum(p0), sum(p1), sum(p2), 0};
@@ -255,7 +285,13 @@ _SOLVE = """
         z_x.data[i].c[1] += x[1];
         z_x.data[i].c[2] += x[2];
 #if K == 4
-        z_s.data[2 * i + direction] = x[3];
+        const SCALAR* across = inv + 16;
+        SCALAR* own_rate = z_s.data + 2 * i + direction;
+        SCALAR* other_rate = z_s.data + 2 * i + 1 - direction;
+        const SCALAR other = across[3] * r_s.data[2 * i + 1 - direction]
+            - (across[0] * x[0] + across[1] * x[1] + across[2] * x[2]);
+        *own_rate = x[3] + (direction == 0 ? 0 : *own_rate);
+        *other_rate = other + (direction == 0 ? 0 : *other_rate);
 #endif
     }
 """
@@ -263,9 +299,14 @@ SAFE = {wp.float64: "1e-11", wp.float32: "1e-5"}
 """Part of a diagonal entry that its pivot must keep."""
 
 
+def factor_size(unknowns: int) -> int:
+    """Count the numbers of a node in a line's factor: G and E⁻¹, and where yarns slide what the other rate follows."""
+    return 8 * unknowns + 4 * (unknowns == 4)
+
+
 def _snippet(variant: Variant, text: str, unknowns: int) -> str:
     text = text.replace("SAFE", SAFE[variant.scalar]).replace("K == 4", str(int(unknowns == 4)))
-    return memory.rows(variant, text.replace("K", str(unknowns)))
+    return memory.rows(variant, text.replace("SIZE", str(factor_size(unknowns))).replace("K", str(unknowns)))
 
 
 @functools.cache

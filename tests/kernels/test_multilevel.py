@@ -64,22 +64,25 @@ def inverse_where_free(m: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def lines(a: np.ndarray, rows: int, columns: int, free: np.ndarray) -> np.ndarray:
-    """Σ over yarns (L⁻¹ − ½ D⁻¹), of a matrix of positions, and of rates behind them if it has some."""
+    """Σ over yarns (L⁻¹ − ½ D⁻¹), of a matrix of positions; or, of one with rates behind them, L with both rates of each
+    node, the one across the yarn coupled to its own node alone, and a quarter of D⁻¹."""
     nodes = rows * columns
     rates = len(a) > 3 * nodes
     result = np.zeros_like(a)
     grid = np.arange(nodes).reshape(rows, columns)
     yarns = [(0, line) for line in grid] + [(1, line) for line in grid.T]
     for direction, line in yarns:
+        of_rates = [direction, 1 - direction] if rates else []
         unknowns = [
-            np.concatenate([3 * i + np.arange(3), [3 * nodes + 2 * i + direction] if rates else []]).astype(int)
-            for i in line
+            np.concatenate([3 * i + np.arange(3), [3 * nodes + 2 * i + d for d in of_rates]]).astype(int) for i in line
         ]
         every = np.concatenate(unknowns)
         k, at = len(unknowns[0]), np.split(np.arange(len(every)), len(line))
         m = np.zeros((len(every), len(every)))
         for p, q in itertools.product(range(len(line)), repeat=2):
-            block = a[np.ix_(unknowns[p], unknowns[q])]
+            block = a[np.ix_(unknowns[p], unknowns[q])].copy()
+            if p != q:
+                block[4:] = block[:, 4:] = 0.0
             if abs(p - q) <= 1:
                 m[np.ix_(at[p], at[q])] += block
             elif abs(p - q) == 2:
@@ -89,8 +92,8 @@ def lines(a: np.ndarray, rows: int, columns: int, free: np.ndarray) -> np.ndarra
         result[np.ix_(every, every)] += inverse_where_free(m, moves)
         for p in range(len(line)):
             x = at[p][:3]
-            result[np.ix_(every[x], every[x])] -= 0.5 * inverse_where_free(m[np.ix_(x, x)], moves[x])
-        assert k in (3, 4)
+            result[np.ix_(every[x], every[x])] -= (0.25 if rates else 0.5) * inverse_where_free(m[np.ix_(x, x)], moves[x])
+        assert k in (3, 5)
     return result
 
 

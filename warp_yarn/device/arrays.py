@@ -18,6 +18,7 @@ from ..description.seams import sewn
 from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
+from ..kernels.linear.lines import factor_size
 from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
@@ -181,7 +182,7 @@ class Arrays(DeclaredArrays):
         self.sizes |= {
             "line end": len(found.line_start),
             "line node": len(found.line_node),
-            "line factor": 8 * (4 if self.variant.sliding else 3) * len(found.line_node),
+            "line factor": factor_size(4 if self.variant.sliding else 3) * len(found.line_node),
             "level end": len(found.level_start),
             "coarse line end": len(found.coarse_line_start),
             "coarse line node": len(found.coarse_line_node),
