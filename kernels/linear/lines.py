@@ -138,7 +138,7 @@ FETCH
             for (int j = 0; j < K; ++j)
                 pivot[k][j] = line[k][j] - taken[k][j];
         clear(inverse);
-        SCALAR half = K == 4 ? 0.25 : 0.5;
+        SCALAR half = HALF;
         const bool safe = invert(pivot, K, inverse);
         for (int k = 0; k < 3; ++k)
             for (int j = 0; j < 3; ++j) {
@@ -304,8 +304,8 @@ def factor_size(unknowns: int) -> int:
     return 8 * unknowns + 4 * (unknowns == 4)
 
 
-def _snippet(variant: Variant, text: str, unknowns: int) -> str:
-    text = text.replace("SAFE", SAFE[variant.scalar]).replace("K == 4", str(int(unknowns == 4)))
+def _snippet(variant: Variant, text: str, unknowns: int, half: str = "0.5") -> str:
+    text = text.replace("SAFE", SAFE[variant.scalar]).replace("HALF", half).replace("K == 4", str(int(unknowns == 4)))
     return memory.rows(variant, text.replace("SIZE", str(factor_size(unknowns))).replace("K", str(unknowns)))
 
 
@@ -317,7 +317,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     unknowns = 4 if variant.sliding else 3
     BlockMatrix = structs(variant).BlockMatrix
 
-    @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns))
+    @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns, "0.25"))
     def factorize_nodes(
         direction: int,
         begin: int,
