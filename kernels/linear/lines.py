@@ -19,6 +19,7 @@ have, have rows and columns of 0 in both.
 """
 
 import functools
+import re
 from types import SimpleNamespace
 
 import warp as wp
@@ -27,9 +28,9 @@ from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
 
-_FACTORIZE = """
-    // K unknowns a node: three of its position, and where yarns slide the rate along this yarn
-    typedef SCALAR block[K][4];
+FACTORIZE = """
+    // K unknowns a place: a node's position, and where yarns slide its rate along this yarn; or two nodes' positions
+    typedef SCALAR block[K][WIDTH];
     auto product = [](const block& a, const block& b, block& c) {
         for (int i = 0; i < K; ++i)
             for (int j = 0; j < K; ++j) {
@@ -41,7 +42,7 @@ _FACTORIZE = """
     };
     // the inverse of a positive definite matrix by its Cholesky factor; false where it is not safely one
     auto invert = [](const block& m, int size, block& inverse) {
-        SCALAR l[K][4];
+        block l;
         for (int j = 0; j < size; ++j) {
             for (int i = j; i < size; ++i) {
                 SCALAR sum = m[i][j];
@@ -56,7 +57,7 @@ _FACTORIZE = """
             }
         }
         for (int c = 0; c < size; ++c) {
-            SCALAR y[4];
+            SCALAR y[K];
             for (int i = 0; i < size; ++i) {
                 SCALAR sum = i == c;
                 for (int k = c; k < i; ++k)
@@ -77,20 +78,20 @@ _FACTORIZE = """
     };
     auto clear = [](block& m) {
         for (int i = 0; i < K; ++i)
-            for (int j = 0; j < 4; ++j)
+            for (int j = 0; j < WIDTH; ++j)
                 m[i][j] = 0;
     };
 FETCH
-    SCALAR free[4], free_before[4] = {0, 0, 0, 0};
+    SCALAR free[WIDTH], free_before[WIDTH] = {};
     block own, far, far_before, far_next, next, pivot, inverse, before;
     clear(far_before);
     clear(far_next);
     clear(before);
     clear(inverse);
     for (int e = begin; e < end; ++e) {
-        const int i = node.data[e];
+        const int i = PLACE;
         SCALAR* g = factor.data + (size_t)e * SIZE;
-        SCALAR* inv = g + 4 * K;
+        SCALAR* inv = g + COLUMN * K;
         is_free(i, free);
         diagonal(i, own);
         SCALAR across[4] = {0, 0, 0, 0}, slides[3] = {0, 0, 0};
@@ -115,7 +116,7 @@ FETCH
                 line[k][j] = own[k][j] + lumped * free[k] * free[j];
             }
         for (int k = 0; k < K; ++k)
-            for (int j = 0; j < 4; ++j) {
+            for (int j = 0; j < WIDTH; ++j) {
                 far_before[k][j] = far_next[k][j];
                 far_next[k][j] = far[k][j];
             }
@@ -150,6 +151,7 @@ FETCH
             if (!invert(own, K, inverse))
                 clear(inverse);
         }
+#if K != 6
         block beside;
         clear(beside);
         if (half > 0 && !invert(line, 3, beside))
@@ -161,16 +163,23 @@ FETCH
             const SCALAR mine = half * mask[k] * sum[k];
             halves.data[i].c[k] = direction == 0 ? mine : halves.data[i].c[k] + mine;
         }
+#endif
         for (int k = 0; k < K; ++k)
             for (int j = 0; j < K; ++j)
                 inverse[k][j] *= free[k] * free[j];
+        for (int k = 0; k < 2 * COLUMN * K; ++k)
+            g[k] = 0;
         for (int j = 0; j < K; ++j)
-            for (int k = 0; k < 4; ++k) {
-                g[4 * j + k] = k < K ? gain[k][j] : 0;
-                inv[4 * j + k] = k < K ? inverse[k][j] : 0;
+            for (int k = 0; k < K; ++k) {
+                // of two nodes, each has a row of four
+                const int at = COLUMN * j + k + (K == 6 && k > 2);
+                g[at] = gain[k][j];
+                inv[at] = inverse[k][j];
             }
-        for (int k = 8 * K; k < SIZE; ++k)
-            g[k] = across[k - 8 * K];
+#if K == 4
+        for (int k = 0; k < 4; ++k)
+            g[8 * K + k] = across[k];
+#endif
         upper(i, direction, next);
         for (int k = 0; k < K; ++k)
             free_before[k] = free[k];
@@ -301,12 +310,25 @@ SAFE = {wp.float64: "1e-11", wp.float32: "1e-5"}
 
 def factor_size(unknowns: int) -> int:
     """Count the numbers of a node in a line's factor: G and E⁻¹, and where yarns slide what the other rate follows."""
-    return 8 * unknowns + 4 * (unknowns == 4)
+    return 2 * _column(unknowns) * unknowns + 4 * (unknowns == 4)
 
 
-def _snippet(variant: Variant, text: str, unknowns: int, half: str = "0.5") -> str:
-    text = text.replace("SAFE", SAFE[variant.scalar]).replace("HALF", half).replace("K == 4", str(int(unknowns == 4)))
-    return memory.rows(variant, text.replace("SIZE", str(factor_size(unknowns))).replace("K", str(unknowns)))
+def _column(unknowns: int) -> int:
+    return 8 if unknowns == 6 else 4
+
+
+def snippet(variant: Variant, text: str, unknowns: int, half: str = "0.5", place: str = "node.data[e]") -> str:
+    """Make a function's C++ for so many unknowns of each place along a line."""
+    words = {
+        "SAFE": SAFE[variant.scalar],
+        "HALF": half,
+        "PLACE": place,
+        "SIZE": factor_size(unknowns),
+        "COLUMN": _column(unknowns),
+        "WIDTH": max(unknowns, 4),
+        "K": unknowns,
+    }
+    return memory.rows(variant, re.sub(r"\b(" + "|".join(words) + r")\b", lambda found: str(words[found[0]]), text))
 
 
 @functools.cache
@@ -317,7 +339,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     unknowns = 4 if variant.sliding else 3
     BlockMatrix = structs(variant).BlockMatrix
 
-    @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns, "0.25"))
+    @wp.func_native(snippet(variant, FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns, "0.25"))
     def factorize_nodes(
         direction: int,
         begin: int,
@@ -332,7 +354,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Factorizes a line of the cloth, and adds ½ D⁻¹ to the halves of its nodes; warp yarns come first."""
         ...
 
-    @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_COARSE), 3))
+    @wp.func_native(snippet(variant, FACTORIZE.replace("FETCH", _FETCH_COARSE), 3))
     def factorize_coarse(
         direction: int,
         begin: int,
@@ -346,7 +368,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Factorizes a line of a coarse level."""
         ...
 
-    @wp.func_native(_snippet(variant, _SOLVE, unknowns))
+    @wp.func_native(snippet(variant, _SOLVE, unknowns))
     def solve_nodes(
         direction: int,
         begin: int,
@@ -362,7 +384,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Add up z += L⁻¹ r of a line of the cloth; of rates z = L⁻¹ r, each of which is on one line alone."""
         ...
 
-    @wp.func_native(_snippet(variant, _SOLVE, 3))
+    @wp.func_native(snippet(variant, _SOLVE, 3))
     def solve_coarse(
         direction: int,
         begin: int,

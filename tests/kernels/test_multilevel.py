@@ -2,12 +2,15 @@
 
 import functools
 import itertools
+import math
+from unittest import mock
 
 import numpy as np
 import pytest
 from cases import make_state
 
 import warp_yarn as wy
+from warp_yarn.device import defaults
 from warp_yarn.device.threads import SOLVED
 from warp_yarn.presets.fabrics import FABRICS
 
@@ -17,7 +20,14 @@ FEWEST, COARSEST = 3, 9
 
 @functools.cache
 def simulator(
-    fabric: str, rows: int, columns: int, sliding: bool, pins: str = "none", precision: str = "double", **options
+    fabric: str,
+    rows: int,
+    columns: int,
+    sliding: bool,
+    pins: str = "none",
+    precision: str = "double",
+    with_strips: bool = False,
+    **options,
 ) -> wy.Simulator:
     cloth = FABRICS[fabric](rows=rows, columns=columns)
     held = {
@@ -27,7 +37,10 @@ def simulator(
     }
     acts = {"pins": held[pins], "pin_stiffness": None if pins == "exact" else 1e4}
     scene = wy.Scene(cloth, sliding=sliding, **acts)
-    return wy.Simulator(scene, integrator="linear", preconditioner="multilevel", precision=precision, **options)
+    with mock.patch.object(defaults, "INEXTENSIBLE", math.inf if with_strips else 0.0):
+        sim = wy.Simulator(scene, integrator="linear", preconditioner="multilevel", precision=precision, **options)
+    assert (sim.arrays.dims["strips"] > 0) == with_strips
+    return sim
 
 
 def assemble(sim: wy.Simulator, name: str, stage: float):
@@ -63,9 +76,9 @@ def inverse_where_free(m: np.ndarray, free: np.ndarray) -> np.ndarray:
     return result
 
 
-def lines(a: np.ndarray, rows: int, columns: int, free: np.ndarray) -> np.ndarray:
-    """Σ over yarns (L⁻¹ − ½ D⁻¹), of a matrix of positions; or, of one with rates behind them, L with both rates of each
-    node, the one across the yarn coupled to its own node alone, and a quarter of D⁻¹."""
+def lines(a: np.ndarray, rows: int, columns: int, free: np.ndarray, part: float = 0.5) -> np.ndarray:
+    """Σ over yarns (L⁻¹ − part · D⁻¹), of a matrix of positions. Of one with rates behind them L has both rates of each
+    node, the one across the yarn coupled to its own node alone."""
     nodes = rows * columns
     rates = len(a) > 3 * nodes
     result = np.zeros_like(a)
@@ -92,8 +105,28 @@ def lines(a: np.ndarray, rows: int, columns: int, free: np.ndarray) -> np.ndarra
         result[np.ix_(every, every)] += inverse_where_free(m, moves)
         for p in range(len(line)):
             x = at[p][:3]
-            result[np.ix_(every[x], every[x])] -= (0.25 if rates else 0.5) * inverse_where_free(m[np.ix_(x, x)], moves[x])
+            result[np.ix_(every[x], every[x])] -= part * inverse_where_free(m[np.ix_(x, x)], moves[x])
         assert k in (3, 5)
+    return result
+
+
+def strips(a: np.ndarray, rows: int, columns: int, free: np.ndarray) -> np.ndarray:
+    """Σ over neighbouring yarns S⁻¹, of a matrix of positions."""
+    result = np.zeros_like(a)
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    pairs = [yarns[k : k + 2] for yarns in (grid, grid.T) for k in range(len(yarns) - 1)]
+    for pair in pairs:
+        side, place = (values.ravel() for values in np.indices(pair.shape))
+        every = (3 * pair.ravel()[:, None] + np.arange(3)).ravel()
+        m = a[np.ix_(every, every)]
+        for p, q in itertools.product(range(pair.size), repeat=2):
+            at, of = (slice(3 * k, 3 * k + 3) for k in (p, q))
+            apart = abs(place[p] - place[q])
+            if apart == 2 and side[p] == side[q]:
+                m[at, at] += 0.5 * (m[at, of] + m[at, of].T)
+            if apart > 1:
+                m[at, of] = 0.0
+        result[np.ix_(every, every)] += inverse_where_free(m, free[every])
     return result
 
 
@@ -106,10 +139,14 @@ def interpolation(count: int) -> np.ndarray:
     return result
 
 
-def dense_preconditioner(a: np.ndarray, rows: int, columns: int, free: np.ndarray) -> np.ndarray:
+def dense_preconditioner(
+    a: np.ndarray, rows: int, columns: int, free: np.ndarray, with_strips: bool = False
+) -> np.ndarray:
     """P⁻¹ by its definition."""
-    result = lines(a, rows, columns, free)
+    result = lines(a, rows, columns, free, 0.25)
     n = 3 * rows * columns
+    if with_strips:
+        result[:n, :n] += strips(a[:n, :n], rows, columns, free[:n])
     small = a[:n, :n] * np.outer(free[:n], free[:n])
     # from the unknowns of a level to those of the cloth
     carried = np.diag(free[:n].astype(float))
@@ -151,11 +188,12 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("with_strips", [False, True])
 @pytest.mark.parametrize(("fabric", "rows", "columns", "sliding", "pins", "state", "stage"), CASES)
-def test_it_is_its_definition_symmetric_and_positive(fabric, rows, columns, sliding, pins, state, stage):
-    sim = simulator(fabric, rows, columns, sliding, pins)
+def test_it_is_its_definition_symmetric_and_positive(fabric, rows, columns, sliding, pins, state, stage, with_strips):
+    sim = simulator(fabric, rows, columns, sliding, pins, with_strips=with_strips)
     a, free = assemble(sim, state, stage)
-    found, expected = all_of_it(sim), dense_preconditioner(a, rows, columns, free)
+    found, expected = all_of_it(sim), dense_preconditioner(a, rows, columns, free, with_strips)
     # rounding, times the condition of a line or of the coarsest level: up to some 1e6, of the stiffest yarns
     assert np.abs(scaled(found - expected, expected)).max() < 1e-8
     assert np.abs(scaled(found - found.T, expected)).max() < 1e-8
@@ -168,9 +206,9 @@ def test_it_is_its_definition_symmetric_and_positive(fabric, rows, columns, slid
 
 @pytest.mark.parametrize("sliding", [False, True])
 def test_in_single_precision(sliding):
-    sim = simulator("handkerchief", 5, 8, sliding, "springs", "single")
+    sim = simulator("handkerchief", 5, 8, sliding, "springs", "single", sliding)
     a, free = assemble(sim, "random", 1e-3)
-    found, expected = all_of_it(sim), dense_preconditioner(a, 5, 8, free)
+    found, expected = all_of_it(sim), dense_preconditioner(a, 5, 8, free, sliding)
     # 6e-8 times a condition of some 1e4
     assert np.abs(scaled(found - expected, expected)).max() < 5e-3
     inside = scaled(found, expected)[np.ix_(free, free)]
@@ -209,11 +247,13 @@ def test_a_solve_is_numpys(fabric, rows, columns, sliding, pins, state, stage):
     assert off @ inner @ off < allowed**2 * (expected @ inner @ expected)
 
 
+@pytest.mark.parametrize("with_strips", [False, True])
 @pytest.mark.parametrize("sliding", [False, True])
-def test_two_threads_make_the_same_iterates(sliding):
+def test_two_threads_make_the_same_iterates(sliding, with_strips):
     ends = []
     for threads in (1, 2):
-        sim = simulator("handkerchief", 5, 17, sliding, "exact", threads=threads, tolerance=1e-3)
+        options = {"threads": threads, "tolerance": 1e-3, "with_strips": with_strips}
+        sim = simulator("handkerchief", 5, 17, sliding, "exact", **options)
         assert sim.model.threads.count == threads
         start = sim.state
         start.velocity[:] = np.random.default_rng(3).normal(0.0, 0.1, start.velocity.shape)
