@@ -7,7 +7,7 @@ along. A line holds its neighbours, and is stretched by that; two yarns together
 in two of them, so every four crossings beside each other are in one along the warp and in one along the weft.
 
 S is the block-tridiagonal part of the matrix of positions along a strip, in blocks of two nodes. It is factorized and
-solved as lines are (``lines.py``), so it is positive definite whatever A is. Index arrays are those of
+solved as lines are (``block_tridiagonal.py``), so it is positive definite whatever A is. Index arrays are those of
 ``warp_yarn/description/strips.py``; strips of one phase have no node in common.
 """
 
@@ -19,7 +19,7 @@ import warp as wp
 from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
-from .lines import FACTORIZE, snippet
+from .block_tridiagonal import FACTORIZE, snippet
 
 _FETCH = """
     const int nodes = blocks.diagonal_xx.shape[0];

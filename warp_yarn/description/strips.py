@@ -48,6 +48,8 @@ def strips(topology: Topology, stencil: int) -> Strips:
         for parity in range(2):
             for first in range(parity, len(yarns) - 1, 2):
                 pair = yarns[first : first + 2].T
+                if not (pair >= 0).any(axis=0).all():
+                    continue
                 pair = pair[(pair >= 0).any(axis=1)]
                 # places apart from each other have no block between them
                 nodes.append(pair)

@@ -19,7 +19,7 @@ from ..description.strips import NONE, strips
 from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
-from ..kernels.linear.lines import factor_size
+from ..kernels.linear.block_tridiagonal import factor_size
 from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions

@@ -9,7 +9,7 @@ The field ``when`` names a condition of the scene (``fields.conditions``). Where
 import dataclasses
 
 from ..description.strips import SOURCES
-from ..kernels.linear.lines import factor_size
+from ..kernels.linear.block_tridiagonal import factor_size
 from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
 from .fields import Field, Group
 
