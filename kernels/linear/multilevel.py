@@ -5,7 +5,8 @@
 R interpolates bilinearly from every 2nd, 4th, 8th … yarn to the cloth. Lines solve exactly along yarns (``lines.py``),
 levels take what is smooth across them, so the iterations depend on neither the number of yarns nor their stiffness,
 where those of the incomplete factorization grow with both. All parts are added up, so they can be solved at the same
-time, and each is positive definite, so P is. Rates of sliding have lines, and no part in the levels.
+time, and each is positive definite, so P is. Rates of sliding have lines, and no part in the levels. Where yarns hardly
+stretch, strips of two yarns are added too (``strips.py``).
 
 Its index arrays are those of ``warp_yarn/description/levels.py``. Every loop here is over nodes, lines or coarse nodes
 that do not depend on each other, a share of them for each processor core (``threads.py``); between two loops all wait
