@@ -5,6 +5,7 @@ has a node; free ends of yarns are in none.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -74,7 +75,7 @@ def strips(topology: Topology, stencil: int) -> Strips:
     return Strips(*(np.array(values, dtype=np.int32) for values in (phases, starts, node, source)))
 
 
-def _finder(topology: Topology, stencil: int):
+def _finder(topology: Topology, stencil: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Makes what finds the blocks between nodes and others, or 0."""
     near = topology.neighbour[:, :stencil]
     node, slot = np.nonzero(near >= 0)
