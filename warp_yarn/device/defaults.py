@@ -31,7 +31,7 @@ HOLDING = 10.0
 """Times h k_s/L that friction's damping must have to hold the rates."""
 BENT = 12.0
 """Times k_b/L³ that a yarn resists where crossings go up and down in turn: 6 of each of the two yarns."""
-INEXTENSIBLE = 5e-6
+INEXTENSIBLE = 8e-6
 """What crossings have against going up and down in turn, mass and bending, over k_s/L: below, kinked yarns move in ways
 that single lines do not know, and strips of two take less time."""
 RESOLVED = 4.0
