@@ -228,9 +228,10 @@ def test_in_single_precision(sliding):
     assert np.linalg.eigvalsh(0.5 * (inside + inside.T)).min() > 0.0
 
 
+@pytest.mark.parametrize("with_strips", [False, True])
 @pytest.mark.parametrize(("fabric", "rows", "columns", "sliding", "pins", "state", "stage"), CASES)
-def test_a_solve_is_numpys(fabric, rows, columns, sliding, pins, state, stage):
-    sim = simulator(fabric, rows, columns, sliding, pins, tolerance=1e-12)
+def test_a_solve_is_numpys(fabric, rows, columns, sliding, pins, state, stage, with_strips):
+    sim = simulator(fabric, rows, columns, sliding, pins, with_strips=with_strips, tolerance=1e-12)
     a, free = assemble(sim, state, stage)
     n = 3 * sim.scene.cloth.nodes
     rng = np.random.default_rng(1)
