@@ -18,6 +18,7 @@ from .linear import (
     incomplete_cholesky,
     multilevel,
     multilevel_conjugate_gradient,
+    strips,
 )
 from .nonlinear import line_search, newton
 from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
@@ -144,6 +145,7 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         conjugate_gradient,
         multilevel,
         multilevel_conjugate_gradient,
+        strips,
         dirk,
         newton,
         line_search,

@@ -74,8 +74,8 @@ def check_directional_derivatives(
 
         h = 3e-6
         expected = (4.0 * difference(h) - difference(2.0 * h)) / 3.0
-        # differences of numbers near 1 that Newton's iteration leaves 1e-12 uncertain, over 3e-6
-        assert found == pytest.approx(expected, rel=1e-5, abs=1e-6), name
+        # differences of numbers near 1 that solves leave some 1e-12 uncertain, over 3e-6: up to 1.2e-6 is seen
+        assert found == pytest.approx(expected, rel=1e-5, abs=2e-6), name
 
 
 FEW = {("linear", "exact pins"), ("sdirk2", "forces"), ("sdirk2", "initial state"), ("ros2", "exact pins")}

@@ -137,6 +137,14 @@ def structs(variant: Variant) -> SimpleNamespace:
         halves: wp.array(dtype=sym33)
         coarse_halves: wp.array(dtype=sym33)
         coarsest: wp.array(dtype=scalar)
+        # strips of two yarns (``warp_yarn.description.strips.Strips``), if there are any
+        strips: int
+        strip_phase: wp.array(dtype=int)
+        strip_start: wp.array(dtype=int)
+        strip_node: wp.array(dtype=int)
+        strip_source: wp.array(dtype=int)
+        strip_factor: wp.array(dtype=scalar)
+        strip_work: wp.array(dtype=scalar)
         # work space
         line_work: wp.array(dtype=scalar)
         coarse_line_work: wp.array(dtype=scalar)

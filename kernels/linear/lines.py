@@ -4,16 +4,16 @@
 
 L is the block-tridiagonal part of the matrix A along one yarn, the positions of its nodes and the rates at which they
 slide along it; D its diagonal blocks of positions. Every node is on a warp yarn and on a weft yarn, so each takes half
-of D⁻¹ away, which both have. What A couples beyond the next node of a yarn (bending) goes to the diagonal blocks of
-both nodes.
+of D⁻¹ away, which both have; on the cloth itself a quarter, which takes fewer iterations where it is crumpled.
+
+A node has another rate, across the line, which follows it: where it is stretched unevenly, position and both rates go
+together. L has that rate too, coupled to its own node alone, and eliminates it: ``across`` has what it follows by,
+A_sx / A_ss, and 1 / A_ss.
 
 P is positive definite whatever A: L⁻¹ − ½ D⁻¹ is, because L and the same matrix with the other sign on what is beside
-the diagonal, 2 D − L, have the same pivots. Where a pivot is not safely positive the node's own block takes its place,
-and nothing is taken away there.
-
-A line is factorized as L = (I + G) E (I + G)ᵀ, G below the diagonal. ``factor`` has Gᵢ and Eᵢ⁻¹ of the nodes of all
-lines, line after line, by columns, each of four numbers. What is held, and rates that a node on the border does not
-have, have rows and columns of 0 in both.
+the diagonal, 2 D − L, have the same pivots. Where a pivot is not safe (``block_tridiagonal.py``) nothing is taken away,
+and no rate eliminated. What is held, and rates that a node on the border does not have, have rows and columns of 0 in
+the factor, whose places are nodes.
 
 ``multilevel.py`` has the coarser grids, whose lines are solved alike. Coarse nodes have positions alone.
 """
@@ -23,144 +23,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
+from .block_tridiagonal import FACTORIZE, snippet
 
-_FACTORIZE = """
-    // K unknowns a node: three of its position, and where yarns slide the rate along this yarn
-    typedef SCALAR block[K][4];
-    auto product = [](const block& a, const block& b, block& c) {
-        for (int i = 0; i < K; ++i)
-            for (int j = 0; j < K; ++j) {
-                SCALAR sum = 0;
-                for (int k = 0; k < K; ++k)
-                    sum += a[i][k] * b[k][j];
-                c[i][j] = sum;
-            }
-    };
-    // the inverse of a positive definite matrix by its Cholesky factor; false where it is not safely one
-    auto invert = [](const block& m, int size, block& inverse) {
-        SCALAR l[K][4];
-        for (int j = 0; j < size; ++j) {
-            for (int i = j; i < size; ++i) {
-                SCALAR sum = m[i][j];
-                for (int k = 0; k < j; ++k)
-                    sum -= l[i][k] * l[j][k];
-                if (i == j) {
-                    if (!(sum > (SCALAR)SAFE * m[j][j]))
-                        return false;
-                    l[j][j] = 1 / sqrt(sum);
-                } else
-                    l[i][j] = sum * l[j][j];
-            }
-        }
-        for (int c = 0; c < size; ++c) {
-            SCALAR y[4];
-            for (int i = 0; i < size; ++i) {
-                SCALAR sum = i == c;
-                for (int k = c; k < i; ++k)
-                    sum -= l[i][k] * y[k];
-                y[i] = i < c ? 0 : sum * l[i][i];
-            }
-            for (int i = size - 1; i >= c; --i) {
-                SCALAR sum = y[i];
-                for (int k = i + 1; k < size; ++k)
-                    sum -= l[k][i] * inverse[k][c];
-                inverse[i][c] = sum * l[i][i];
-            }
-        }
-        for (int i = 0; i < size; ++i)
-            for (int j = i + 1; j < size; ++j)
-                inverse[i][j] = inverse[j][i];
-        return true;
-    };
-    auto clear = [](block& m) {
-        for (int i = 0; i < K; ++i)
-            for (int j = 0; j < 4; ++j)
-                m[i][j] = 0;
-    };
-FETCH
-    SCALAR free[4], free_before[4] = {0, 0, 0, 0};
-    block own, far, far_before, far_next, next, pivot, inverse, before;
-    clear(far_before);
-    clear(far_next);
-    clear(before);
-    clear(inverse);
-    for (int e = begin; e < end; ++e) {
-        const int i = node.data[e];
-        SCALAR* g = factor.data + (size_t)e * 8 * K;
-        SCALAR* inv = g + 4 * K;
-        is_free(i, free);
-        diagonal(i, own);
-        for (int k = 0; k < K; ++k)
-            if (free[k] == 0) {
-                for (int j = 0; j < K; ++j)
-                    own[k][j] = own[j][k] = 0;
-                own[k][k] = 1;
-            }
-        // what is coupled beyond the next node, its symmetric part on the diagonal of both nodes
-        upper(i, 2 + direction, far);
-        block line;
-        for (int k = 0; k < K; ++k)
-            for (int j = 0; j < K; ++j) {
-                const SCALAR lumped = (far[k][j] + far[j][k] + far_before[k][j] + far_before[j][k]) / 2;
-                line[k][j] = own[k][j] + lumped * free[k] * free[j];
-            }
-        for (int k = 0; k < K; ++k)
-            for (int j = 0; j < 4; ++j) {
-                far_before[k][j] = far_next[k][j];
-                far_next[k][j] = far[k][j];
-            }
-        // G = Uᵀ E⁻¹ of the node before
-        block gain, taken;
-        clear(gain);
-        clear(taken);
-        if (e > begin) {
-            for (int k = 0; k < K; ++k)
-                for (int j = 0; j < K; ++j)
-                    next[k][j] *= free_before[k] * free[j];
-            block turned;
-            for (int k = 0; k < K; ++k)
-                for (int j = 0; j < K; ++j)
-                    turned[k][j] = next[j][k];
-            product(turned, inverse, gain);
-            product(gain, next, taken);
-        }
-        for (int k = 0; k < K; ++k)
-            for (int j = 0; j < K; ++j)
-                pivot[k][j] = line[k][j] - taken[k][j];
-        clear(inverse);
-        SCALAR half = 0.5;
-        if (!invert(pivot, K, inverse)) {
-            half = 0;
-            if (!invert(own, K, inverse))
-                clear(inverse);
-        }
-        block beside;
-        clear(beside);
-        if (half > 0 && !invert(line, 3, beside))
-            half = 0;
-        SCALAR sum[6] = {beside[0][0], beside[0][1], beside[0][2], beside[1][1], beside[1][2], beside[2][2]};
-        const SCALAR mask[6] = {free[0] * free[0], free[0] * free[1], free[0] * free[2],
-                                free[1] * free[1], free[1] * free[2], free[2] * free[2]};
-        for (int k = 0; k < 6; ++k) {
-            const SCALAR mine = half * mask[k] * sum[k];
-            halves.data[i].c[k] = direction == 0 ? mine : halves.data[i].c[k] + mine;
-        }
-        for (int k = 0; k < K; ++k)
-            for (int j = 0; j < K; ++j)
-                inverse[k][j] *= free[k] * free[j];
-        for (int j = 0; j < K; ++j)
-            for (int k = 0; k < 4; ++k) {
-                g[4 * j + k] = k < K ? gain[k][j] : 0;
-                inv[4 * j + k] = k < K ? inverse[k][j] : 0;
-            }
-        upper(i, direction, next);
-        for (int k = 0; k < K; ++k)
-            free_before[k] = free[k];
-    }
-"""
 _FETCH_NODES = """
     auto is_free = [&](int i, SCALAR* free) {
         free[0] = free[1] = free[2] = is_free_x.data[i] != 0;
@@ -176,6 +42,19 @@ _FETCH_NODES = """
         m[3][3] = blocks.diagonal_ss.data[2 * i + direction];
 #endif
     };
+#if SLIDING
+    auto other_rate = [&](int i, SCALAR free, SCALAR* across, SCALAR* slides) {
+        const int o = 2 * i + 1 - direction;
+        const SCALAR d = blocks.diagonal_ss.data[o];
+        if (is_crossing.data[i] == 0 || !(d > 0))
+            return;
+        across[3] = 1 / d;
+        for (int k = 0; k < 3; ++k) {
+            slides[k] = free * blocks.diagonal_xs.data[o].c[k];
+            across[k] = slides[k] / d;
+        }
+    };
+#endif
     auto upper = [&](int i, int slot, block& m) {
         if (slot >= blocks.stencil || blocks.neighbour.data[blocks.stencil * i + slot] < 0) {
             clear(m);
@@ -207,18 +86,20 @@ _FETCH_COARSE = """
 """
 _SOLVE = """
     auto vector = [&](int i) {
-#if K == 4
-        return row{r_x.data[i].c[0], r_x.data[i].c[1], r_x.data[i].c[2], r_s.data[2 * i + direction]};
-#else
         return row{r_x.data[i].c[0], r_x.data[i].c[1], r_x.data[i].c[2], 0};
-#endif
     };
     auto column = [](const SCALAR* m, int k) { return *(const row*)(m + 4 * k); };
     // y ← (I + G)⁻¹ r
     row y = {};
     for (int e = begin; e < end; ++e) {
-        const SCALAR* g = factor.data + (size_t)e * 8 * K;
-        row a = vector(node.data[e]) - column(g, 0) * y[0];
+        const int i = node.data[e];
+        const SCALAR* g = factor.data + (size_t)e * SIZE;
+        row r = vector(i);
+#if K == 4
+        r = r - column(g, 8) * r_s.data[2 * i + 1 - direction];
+        r[3] = r_s.data[2 * i + direction];
+#endif
+        row a = r - column(g, 0) * y[0];
         row b = column(g, 1) * y[1];
         a = a - column(g, 2) * y[2];
 #if K == 4
@@ -230,7 +111,7 @@ _SOLVE = """
     // z += (I + G)⁻ᵀ E⁻¹ y
     row x = {};
     for (int e = end - 1; e >= begin; --e) {
-        const SCALAR* inv = factor.data + (size_t)e * 8 * K + 4 * K;
+        const SCALAR* inv = factor.data + (size_t)e * SIZE + 4 * K;
         const row own = *(const row*)(work.data + 4 * (size_t)e);
         row a = column(inv, 0) * own[0] + column(inv, 1) * own[1];
         row b = column(inv, 2) * own[2];
@@ -239,7 +120,7 @@ _SOLVE = """
 #endif
         if (e + 1 < end) {
             // Gᵀ of the node behind
-            const SCALAR* g = factor.data + (size_t)(e + 1) * 8 * K;
+            const SCALAR* g = factor.data + (size_t)(e + 1) * SIZE;
             const row p0 = column(g, 0) * x, p1 = column(g, 1) * x, p2 = column(g, 2) * x;
             auto sum = [](row p) { return p[0] + p[1] + p[2] + p[3]; };
             row taken = {sum(p0), sum(p1), sum(p2), 0};
@@ -255,17 +136,16 @@ _SOLVE = """
         z_x.data[i].c[1] += x[1];
         z_x.data[i].c[2] += x[2];
 #if K == 4
-        z_s.data[2 * i + direction] = x[3];
+        const SCALAR* across = inv + 16;
+        SCALAR* own_rate = z_s.data + 2 * i + direction;
+        SCALAR* other_rate = z_s.data + 2 * i + 1 - direction;
+        const SCALAR other = across[3] * r_s.data[2 * i + 1 - direction]
+            - (across[0] * x[0] + across[1] * x[1] + across[2] * x[2]);
+        *own_rate = x[3] + (direction == 0 ? 0 : *own_rate);
+        *other_rate = other + (direction == 0 ? 0 : *other_rate);
 #endif
     }
 """
-SAFE = {wp.float64: "1e-11", wp.float32: "1e-5"}
-"""Part of a diagonal entry that its pivot must keep."""
-
-
-def _snippet(variant: Variant, text: str, unknowns: int) -> str:
-    text = text.replace("SAFE", SAFE[variant.scalar]).replace("K == 4", str(int(unknowns == 4)))
-    return memory.rows(variant, text.replace("K", str(unknowns)))
 
 
 @functools.cache
@@ -276,7 +156,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     unknowns = 4 if variant.sliding else 3
     BlockMatrix = structs(variant).BlockMatrix
 
-    @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns))
+    @wp.func_native(snippet(variant, FACTORIZE.replace("FETCH", _FETCH_NODES), unknowns, "0.25"))
     def factorize_nodes(
         direction: int,
         begin: int,
@@ -291,7 +171,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Factorizes a line of the cloth, and adds ½ D⁻¹ to the halves of its nodes; warp yarns come first."""
         ...
 
-    @wp.func_native(_snippet(variant, _FACTORIZE.replace("FETCH", _FETCH_COARSE), 3))
+    @wp.func_native(snippet(variant, FACTORIZE.replace("FETCH", _FETCH_COARSE), 3))
     def factorize_coarse(
         direction: int,
         begin: int,
@@ -305,7 +185,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Factorizes a line of a coarse level."""
         ...
 
-    @wp.func_native(_snippet(variant, _SOLVE, unknowns))
+    @wp.func_native(snippet(variant, _SOLVE, unknowns))
     def solve_nodes(
         direction: int,
         begin: int,
@@ -321,7 +201,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Add up z += L⁻¹ r of a line of the cloth; of rates z = L⁻¹ r, each of which is on one line alone."""
         ...
 
-    @wp.func_native(_snippet(variant, _SOLVE, 3))
+    @wp.func_native(snippet(variant, _SOLVE, 3))
     def solve_coarse(
         direction: int,
         begin: int,

@@ -5,7 +5,8 @@
 R interpolates bilinearly from every 2nd, 4th, 8th … yarn to the cloth. Lines solve exactly along yarns (``lines.py``),
 levels take what is smooth across them, so the iterations depend on neither the number of yarns nor their stiffness,
 where those of the incomplete factorization grow with both. All parts are added up, so they can be solved at the same
-time, and each is positive definite, so P is. Rates of sliding have lines, and no part in the levels.
+time, and each is positive definite, so P is. Rates of sliding have lines, and no part in the levels. Where yarns hardly
+stretch, strips of two yarns are added too (``strips.py``).
 
 Its index arrays are those of ``warp_yarn/description/levels.py``. Every loop here is over nodes, lines or coarse nodes
 that do not depend on each other, a share of them for each processor core (``threads.py``); between two loops all wait
@@ -20,7 +21,7 @@ import warp as wp
 from ..core import memory
 from ..core.structs import structs
 from ..core.variant import Variant
-from . import incomplete_cholesky, lines
+from . import incomplete_cholesky, lines, strips
 from .threads import barrier, partition
 
 SAFE = {wp.float64: 1e-12, wp.float32: 1e-5}
@@ -34,6 +35,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     load, store = memory.functions(variant).load, memory.functions(variant).store
     product = incomplete_cholesky.functions(variant).product
     solve_nodes, solve_coarse = lines.functions(variant).solve_nodes, lines.functions(variant).solve_coarse
+    solve_strip = strips.functions(variant).solve_strip
     Levels = structs(variant).Levels
 
     @wp.func
@@ -117,6 +119,17 @@ def functions(variant: Variant) -> SimpleNamespace:
                     levels.coarse_line_node, levels.coarse_line_factor, levels.coarse_line_work,
                     levels.coarse_r, levels.coarse_z,
                 )  # fmt: skip
+        for phase in range(wp.where(levels.strips > 0, 4, 0)):
+            if threads > 1:
+                arrived += threads
+                barrier(signals, arrived)
+            first = load(levels.strip_phase, phase)
+            size = load(levels.strip_phase, phase + 1) - first
+            for k in range(first + partition(size, thread, threads), first + partition(size, thread + 1, threads)):
+                solve_strip(
+                    load(levels.strip_start, k), load(levels.strip_start, k + 1), levels.strip_node,
+                    levels.strip_factor, levels.strip_work, r_x, z_x,
+                )  # fmt: skip
         if thread == 0 and levels.exact > 0:
             solve_coarsest(levels, load(levels.level_start, count - 1), levels.exact)
         for k in range(count - 1):
@@ -143,7 +156,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     @wp.func
     def barriers(levels: Levels) -> int:
         """Count the barriers that ``precondition`` comes to."""
-        return levels.coarse_levels + 3 + wp.max(levels.coarse_levels - 1, 0)
+        return levels.coarse_levels + 3 + wp.max(levels.coarse_levels - 1, 0) + wp.where(levels.strips > 0, 4, 0)
 
     return SimpleNamespace(precondition=precondition, barriers=barriers)
 

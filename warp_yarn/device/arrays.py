@@ -15,9 +15,11 @@ from ..description.cloths import Cloths
 from ..description.levels import BLOCKS, levels
 from ..description.scene import Scene
 from ..description.seams import sewn
+from ..description.strips import NONE, strips
 from ..description.woven import OF_CROSSINGS
 from ..kernels import TERMS, Term, Variant
 from ..kernels.core.structs import structs
+from ..kernels.linear.block_tridiagonal import factor_size
 from . import contact, crimp, declarations
 from .declared import DeclaredArrays
 from .fields import Field, conditions
@@ -172,16 +174,17 @@ class Arrays(DeclaredArrays):
         self.sizes["frame node"] = count * self.sizes["node"]
         self.make(declarations.FRAMES)
 
-    def add_levels(self) -> None:
+    def add_levels(self, with_strips: bool) -> None:
         """Make room for the multilevel preconditioner: its index arrays, and what it factorizes."""
         free = self["is_free"].numpy() != 0
         found = levels(self.topology, self.stencil, free)
+        beside = strips(self.topology, self.stencil) if with_strips else NONE
         coarse, sizes = found.coarse_nodes, np.diff(found.level_start)
         exact = int(sizes[-1]) if coarse else 0
         self.sizes |= {
             "line end": len(found.line_start),
             "line node": len(found.line_node),
-            "line factor": 8 * (4 if self.variant.sliding else 3) * len(found.line_node),
+            "line factor": factor_size(4 if self.variant.sliding else 3) * len(found.line_node),
             "level end": len(found.level_start),
             "coarse line end": len(found.coarse_line_start),
             "coarse line node": len(found.coarse_line_node),
@@ -192,13 +195,17 @@ class Arrays(DeclaredArrays):
             "any node": self.sizes["node"] + coarse,
             "child": len(found.child),
             "part": len(found.part),
+            "strip phase": len(beside.strip_phase),
+            "strip end": len(beside.strip_start),
+            "strip place": len(beside.strip_node),
             "coarsest pair": exact**2,
             "coarsest entry": (3 * exact) ** 2,
         }
         counts = {"coarse_levels": len(sizes), "blocks_per_node": BLOCKS, "exact": exact}
+        counts["strips"] = len(beside.strip_start) - 1
         result = structs(self.variant.forward).Levels()
         for name, field in declarations.LEVELS.items():
-            value = counts[name] if name in counts else getattr(found, name, None)
+            value = counts[name] if name in counts else getattr(found, name, getattr(beside, name, None))
             if value is None:
                 value = self.new(name)
             elif isinstance(value, np.ndarray):
@@ -210,6 +217,7 @@ class Arrays(DeclaredArrays):
         self.level_start = found.level_start.tolist()
         self.dims["warp_lines"] = found.warp_lines
         self.dims["weft_lines"] = len(found.line_start) - 1 - found.warp_lines
+        self.dims["strips"] = counts["strips"]
         self.dims["coarse_warp_lines"] = found.coarse_warp_lines
         self.dims["coarse_weft_lines"] = len(found.coarse_line_start) - 1 - found.coarse_warp_lines
 

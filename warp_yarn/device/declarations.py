@@ -8,6 +8,8 @@ The field ``when`` names a condition of the scene (``fields.conditions``). Where
 
 import dataclasses
 
+from ..description.strips import SOURCES
+from ..kernels.linear.block_tridiagonal import factor_size
 from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
 from .fields import Field, Group
 
@@ -173,6 +175,13 @@ LEVELS: Group = {
     "halves": Field("node", 1, "sym33", "1/kg", "always", "½ D⁻¹ of both lines of a node"),
     "coarse_halves": Field("coarse node", 1, "sym33", "1/kg", "always", "the same of coarse levels"),
     "coarsest": Field("coarsest entry", 1, "scalar", "", "always", "Cholesky factor of the last level"),
+    "strips": Field("count", 1, "int", "", "always", "strips of two yarns; 0 where lines do"),
+    "strip_phase": Field("strip phase", 1, "int", "", "always", "where the strips of a phase begin"),
+    "strip_start": Field("strip end", 1, "int", "", "always", "where the places of a strip begin"),
+    "strip_node": Field("strip place", 2, "int", "", "always", "both nodes of a place, or -1"),
+    "strip_source": Field("strip place", SOURCES, "int", "", "always", "1 + matrix blocks; negative: transposed; or 0"),
+    "strip_factor": Field("strip place", factor_size(6), "scalar", "", "always", "G and E⁻¹ of all strips"),
+    "strip_work": Field("strip place", 8, "scalar", "", "always", "space to work in"),
     "line_work": Field("line node", 4, "scalar", "", "always", "space to work in, as all that follow"),
     "coarse_line_work": Field("coarse line node", 4, "scalar", "", "always", "the same of coarse levels"),
     "coarse_r": Field("coarse node", 1, "vec3", "N s", "always", "residual"),

@@ -98,7 +98,7 @@ class Model:
         self.zones = ImpactZones(self) if scene.has_impact_zones else None
         self.energy = EnergyWatch(self)
         if self.preconditioner == "multilevel":
-            self.arrays.add_levels()
+            self.arrays.add_levels(defaults.needs_strips(scene, self.step_size))
         self.threads = Threads(self, integer("threads", threads, least=1))
         self.arrays.put("tolerance", self.tolerance)
 
@@ -299,6 +299,8 @@ def _factorize_levels(model: Model) -> None:
     for direction, name in enumerate(("warp_lines", "weft_lines")):
         model.launch("factorize_lines", name, along=direction)
         model.launch("factorize_coarse_lines", f"coarse_{name}", along=direction)
+    if model.arrays.dims["strips"]:
+        model.launch("factorize_strips", "strips")
     if len(starts) > 1:
         first, end = starts[-2:]
         model.launch("factorize_coarsest", 1, first=first, count=end - first)

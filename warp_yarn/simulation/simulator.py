@@ -64,7 +64,7 @@ class Simulator(Loads, Filming):
         preconditioner: of the conjugate gradient, a file of ``kernels/linear`` each: "multilevel", "incomplete" or
             "jacobi" (the diagonal); None: "multilevel" where yarns are stiff for their mass and the step,
             k_s h²/(m L) > 2e4, or > 3 where they slide and friction's damping is less than 10 h k_s/L, else
-            "incomplete".
+            "incomplete". "multilevel" solves neighbouring yarns together where they hardly stretch at all.
         tolerance: of the conjugate gradient: √(r·P⁻¹r) relative to its start, which is the present velocities or 0,
             P the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit
             stages it is that of the adjoint's solves alone.
