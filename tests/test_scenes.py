@@ -99,7 +99,7 @@ def test_weaves_in_words(usd):
         (["--draft", "draft.txt"], "must end in .wif, .dtx, .wpo"),
         (["--draft", "missing.wif"], "missing.wif: there is no such file"),
         (["--draft", str(DRAFT), "--weave", "plain"], "--weave = plain does not go with --draft"),
-        (["--draft", str(DRAFT), "--rows", "2"], "--size = 2"),
+        (["--draft", str(DRAFT), "--rows", "2"], "rows = 2"),
     ],
 )
 def test_drafts_and_weaves_that_cannot_be(arguments, told, usd, capsys):
