@@ -60,7 +60,7 @@ def obstacles(options: argparse.Namespace, length: float) -> tuple[list[Obstacle
         middle = 0.5 * (low + high)
         return [floor, mesh.replace(position=(-middle[0], -middle[1], -low[2]))], float(high[2] - low[2])
     if options.over in (None, "sphere"):
-        radius = 0.25 * length
+        radius = 0.33 * length
         return [floor, wy.Sphere(center=(0, 0, radius), radius=radius, friction=mu)], 2.0 * radius
     if options.over == "box":
         half = np.array([0.22, 0.22, 0.15]) * length
