@@ -82,7 +82,7 @@ class Filming:
         fps: float | None = None,
         after: str | os.PathLike | None = None,
         precision: str = "double",
-        compression: int = 1,
+        compression: int = 0,
         progress: bool | None = False,
         **shown: Any,
     ) -> int:

@@ -68,11 +68,11 @@ class Strands:
 
     def points(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Finds where the yarns pass [points, 3] (m), of places as ``Weaving.look`` gives them."""
-        return places[self.places] + self.height[:, None] * normals[self.places]
+        return places.take(self.places, axis=0) + self.height[:, None] * normals.take(self.places, axis=0)
 
     def slid(self, rest: np.ndarray, euler: np.ndarray) -> np.ndarray:
         """Computes ``arc`` where yarns have slid from (u, v) at rest to others, [nodes, 2] each (m)."""
-        moved = (euler - rest)[self.arc_of[:, 0], self.arc_of[:, 1]]
+        moved = (euler - rest).ravel().take(2 * self.arc_of[:, 0] + self.arc_of[:, 1])
         return self.arc + self.arc_sign * moved
 
 
