@@ -487,6 +487,14 @@ def test_reactions_in_single_precision_are_near_or_say_so():
         simulator.reactions()
 
 
+def test_frames_in_single_precision_are_told_to_be_rough_and_not_refused():
+    """Rounding may be all that stiff yarns give: its own frames do not solve its equations."""
+    simulator = wy.Simulator(moved(None, fabric=wy.fabrics.cotton), precision="single", integrator="implicit-euler")
+    trajectory = simulator.run(8)
+    with pytest.warns(wy.WarpYarnWarning, match=r"step \d of the trajectory does not solve .* precision='double'"):
+        assert np.isfinite(simulator.reactions(trajectory)).all()
+
+
 @pytest.mark.parametrize("ask", ["reactions", "forces", "energy", "system"])
 def test_what_is_near_has_room_in_frames_that_no_step_came_to(ask, monkeypatch):
     """A simulator whose cloths were apart is asked of frames where they touch."""

@@ -306,7 +306,10 @@ def _refuse_others(steps: Steps, off: np.ndarray, slack: np.ndarray) -> None:
         "the simulator that made it knows its steps in parts (simulator.split_steps), others do not; shorter steps are "
         "not made in parts, and a smaller newton_tolerance solves them better"
     )
-    if worst[k] <= FOREIGN:
+    if model.precision == "single":
+        # of stiff yarns rounding alone may be all that pins give, and who made them is not told by that
+        advice += "; precision='double' knows them"
+    if worst[k] <= FOREIGN or model.precision == "single":
         warnings.warn(f"{told}. Ask who made it: {advice}", WarpYarnWarning, stacklevel=5)
         return
     raise InputError(
