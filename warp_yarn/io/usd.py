@@ -243,16 +243,16 @@ class Stage(Film):
             # whole where it is but for rounding, for programs that look at whole ones
             time = round(self.length * self.apart, 9)
             self._place(origin, time)
-            looks = [self.weaving.look(position)]
-            speed = float(np.abs(velocity).max())
-            if self.look["velocities"]:
-                # a millionth of a yarn: all that a point depends on is smooth over that
-                ahead = 1e-6 * self.weaving.strands[0].half.max() / max(speed, np.finfo(float).tiny)
-                looks += [self.weaving.look(position + ahead * velocity)] if speed > 0.0 else []
+            speed = float(np.abs(velocity).max()) if self.look["velocities"] else 0.0
+            # a millionth of a yarn: all that a point depends on is smooth over that
+            ahead = 1e-6 * self.weaving.strands[0].half.max() / max(speed, np.finfo(float).tiny)
+            # far from 0, positions are too coarse to be so little ahead
+            near = position - origin
+            looks = self.weaving.looks(np.stack([near, near + ahead * velocity] if speed > 0.0 else [near]))
             for shape in self.shapes:
                 points, *moved = [shape.points(*look) for look in looks]
                 self._unsaved += self._size(len(points))
-                write_points(shape.prim, time, points - origin, shape.margin)
+                write_points(shape.prim, time, points, shape.margin)
                 if self.look["velocities"]:
                     rate = (moved[0] - points) / (ahead * self.look["slowdown"]) if moved else np.zeros_like(points)
                     shape.prim.GetVelocitiesAttr().Set(vectors(rate), time)
