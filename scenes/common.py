@@ -13,8 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 import warp_yarn as wy
 from warp_yarn.description.weave import woven
 from warp_yarn.errors import integer, missing_extra, real
@@ -26,6 +24,8 @@ from warp_yarn.simulation.pace import ROUNDING
 from warp_yarn.view.camera import checked_view
 from warp_yarn.view.render import check_drawing, checked_size
 
+LEAST_YARNS = 3
+"""Of a weave, either way."""
 MISSING: list[tuple[str, str]] = []
 """Packages that a scene asked for and did not find, and the extras that they are of."""
 
@@ -108,6 +108,40 @@ def settle_length(options: argparse.Namespace, step: float) -> None:
 def frames_a_second(options: argparse.Namespace) -> float | None:
     """Of simulated time, which plays slower; None: a frame a step."""
     return None if options.fps is None else options.fps * options.slowdown
+
+
+BESIDE_A_RECORDING = (
+    "--steps", "--seconds", "--fps", "--slowdown", "--output", "--tubes", "--png", "--mp4", "--pixels", "--view",
+    "--record", "--resume",
+)  # fmt: skip
+"""Options of a run that goes on from a recording; all else is what that has."""
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """The options --record and --resume."""
+    text = "the frames as numbers (.npz, .h5), for --resume and wy.Trajectory.load"
+    parser.add_argument("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
+    text = "go on from the end of a recording, at its frames a second"
+    parser.add_argument("--resume", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
+
+
+def resumed(options: argparse.Namespace, arguments: Sequence[str] | None) -> wy.Simulator | None:
+    """A simulator at the end of the recording that --resume names; None where it names none.
+
+    Args:
+        options: that were read of the arguments.
+        arguments: as main() has them.
+
+    Raises:
+        InputError: an option of what the recording has itself; a recording that cannot be used.
+    """
+    if options.resume is None:
+        return None
+    for argument in sys.argv[1:] if arguments is None else arguments:
+        name = argument.partition("=")[0]
+        if name.startswith("--") and name not in BESIDE_A_RECORDING:
+            raise wy.InputError(f"{name} does not go with --resume: {options.resume} has its own")
+    return wy.Simulator.resumed(options.resume)
 
 
 def simulate(
@@ -275,6 +309,17 @@ def add_weave(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--draft", type=file_ending(*ENDINGS, *map(str.upper, ENDINGS)), metavar="FILE", help=text)
 
 
+def checked_counts(options: argparse.Namespace, *names: str) -> None:
+    """Looks whether the options of these names, numbers of yarns, are enough for a weave, where they are given.
+
+    Raises:
+        InputError: they are not.
+    """
+    for name in names:
+        if getattr(options, name) is not None:
+            integer(f"--{name}", getattr(options, name), least=LEAST_YARNS)
+
+
 def woven_cloth(fabric: str, options: argparse.Namespace, rows: int, columns: int, **more: Any) -> wy.Cloth:
     """A cloth of a fabric, woven as --weave or --draft say."""
     make = FABRICS[fabric]
@@ -328,7 +373,6 @@ def command(main: Callable[[Sequence[str] | None], Any], arguments: Sequence[str
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # what a terminal cannot show becomes a question mark
             stream.reconfigure(errors="replace")
-    wp.config.log_level = wp.LOG_WARNING
     try:
         main(arguments)
     except wy.SimulationError as error:

@@ -4,6 +4,8 @@ python scenes/drape.py                                    the paper's, over a sp
 python scenes/drape.py --over torus --weave satin --png out/drape.png
 python scenes/drape.py --over table --fabric handkerchief --rows 41 --columns 41
 python scenes/drape.py --mesh bunny.obj --scale 0.1       any file that trimesh reads, in metres times the scale
+python scenes/drape.py --record out/drape.npz             and later, to go on from there:
+python scenes/drape.py --resume out/drape.npz --steps 100
 
 Beneath is a floor, but for the table, which is higher than the cloth is long.
 """
@@ -58,7 +60,7 @@ def obstacles(options: argparse.Namespace, length: float) -> tuple[list[Obstacle
         middle = 0.5 * (low + high)
         return [floor, mesh.replace(position=(-middle[0], -middle[1], -low[2]))], float(high[2] - low[2])
     if options.over in (None, "sphere"):
-        radius = 0.25 * length
+        radius = 0.33 * length
         return [floor, wy.Sphere(center=(0, 0, radius), radius=radius, friction=mu)], 2.0 * radius
     if options.over == "box":
         half = np.array([0.22, 0.22, 0.15]) * length
@@ -80,6 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
+    if options.simulator is not None:
+        return touch.go_on(options)
     if options.mesh is not None and options.over is not None:
         raise wy.InputError(f"--over {options.over} and --mesh {options.mesh}, must be one of both")
     if options.mesh is None and options.scale != 1.0:

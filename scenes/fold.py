@@ -52,7 +52,7 @@ def carried(cloth: wy.Cloth, steps: int) -> tuple[np.ndarray, np.ndarray]:
 def joined(before: wy.Trajectory, after: wy.Trajectory) -> wy.Trajectory:
     """Both, as one of the second scene, which goes on in the first one's last state."""
     parts = {name: np.concatenate([getattr(before, name), getattr(after, name)[1:]]) for name in FIELDS}
-    return dataclasses.replace(after, **parts)
+    return dataclasses.replace(after, **parts, start=before.start)
 
 
 def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
@@ -63,6 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
+    if options.simulator is not None:
+        if options.simulator.scene.pin_path is not None:
+            raise wy.InputError(f"--resume {options.resume} ended within the fold, must have let go: begin anew")
+        return touch.go_on(options)
     integer("--fold", options.fold, least=1)
     table = [wy.Plane(point=(0, 0, 0), normal=(0, 0, 1), friction=options.friction)]
     cloth = touch.raised(touch.flat(options), 0.0)
@@ -74,6 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
     if first.stop is None:
         simulator = touch.simulator(held.replace(pins=(), pin_path=None), options)
         simulator.state = first.trajectory[-1]
+        simulator.steps_done = options.fold
         second = simulate(simulator, each_step)
         made = Run(joined(first.trajectory, second.trajectory), first.seconds + second.seconds, second.stop)
     made = dataclasses.replace(made, trajectory=filmed(made.trajectory, options))

@@ -22,25 +22,24 @@ from common import (
     Run,
     add_length,
     add_pictures,
+    add_recording,
     add_weave,
     check_pictures,
+    checked_counts,
     command,
     draw,
     file_ending,
     make_folders,
+    resumed,
     settle_length,
     simulate,
     woven_cloth,
 )
 
 import warp_yarn as wy
-from warp_yarn.io.films import RECORDINGS
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
-
-OF_THE_RECORDING = ("fabric", "size", "rows", "columns", "weave", "draft", "yarns", "wind", "step", "locked")
-"""Options that a recording settles, where one is resumed."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -66,10 +65,7 @@ def parser() -> argparse.ArgumentParser:
     add("--output", type=file_ending(*ENDINGS), default=Path("out/hang.usdc"), metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
     add_pictures(result)
-    text = "the frames as numbers (.npz, .h5), for --resume and wy.Trajectory.load"
-    add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
-    text = "go on from the end of a recording, at its frames a second"
-    add("--resume", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
+    add_recording(result)
     return result
 
 
@@ -81,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = parser().parse_args(arguments)
-    simulator = resumed(options) if options.resume is not None else wy.Simulator(**chosen(options))
+    simulator = resumed(options, arguments) or wy.Simulator(**chosen(options))
     settle_length(options, simulator.step_size)
     make_folders([options.output, options.png, options.mp4, options.record])
     check_pictures(options)
@@ -94,6 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
 
 def chosen(options: argparse.Namespace) -> dict[str, Any]:
     """The scene and the time step that the options name."""
+    checked_counts(options, "size", "rows", "columns")
     size = 17 if options.size is None else options.size
     rows = size if options.rows is None else options.rows
     columns = size if options.columns is None else options.columns
@@ -105,14 +102,6 @@ def chosen(options: argparse.Namespace) -> dict[str, Any]:
     cloth = woven_cloth(fabric, options, rows, columns, **yarns)
     wind = wy.Wind(velocity=tuple(options.wind or paper.WIND))
     return {"scene": paper.hung(cloth, wind=wind, sliding=not options.locked), "step": step}
-
-
-def resumed(options: argparse.Namespace) -> wy.Simulator:
-    """A simulator at the end of the recording."""
-    for name in OF_THE_RECORDING:
-        if getattr(options, name) is not None:
-            raise wy.InputError(f"--{name} does not go with --resume: {options.resume} has its own")
-    return wy.Simulator.resumed(options.resume)
 
 
 def tell(run: Run, options: argparse.Namespace) -> None:

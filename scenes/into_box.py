@@ -48,7 +48,9 @@ with optional("bench"):
 POLICIES = {"forces": "Forces", "network": "Network"}
 SHOWN = (0, 30, 60, 90, 120, box.STEPS)
 """Frames in the picture."""
-VIEW = (-0.3, -1.0, 1.2)
+BESIDE = 8e-3
+"""Of table and floor in the picture, around the cloth and the box [m]."""
+VIEW = (-0.15, -1.0, 1.05)
 """To the camera: along the throw, from above."""
 
 
@@ -150,12 +152,22 @@ def write(
 
 
 def moments(trajectory: wy.Trajectory) -> wy.Trajectory:
-    """One frame that has a cloth for each moment of the throw."""
+    """One frame that has a cloth for each moment of the throw, and of table and floor what is near, for the whole of
+    them would leave the cloths too small."""
     cloths = [trajectory.cloth.replace(pose=trajectory.position[frame]) for frame in SHOWN]
     table, floor, *walls = trajectory.scene.obstacles
+    edge, high = table.position[0] + table.size[0], table.size[2]
+    half = 0.5 * (edge + BESIDE)
+    top = wy.Box(center=(edge - half, 0, -high), half_extents=(half, BESIDE, high), friction=table.friction)
     # planes are drawn beneath the first cloth alone
-    slab = wy.Box(center=(30e-3, 0, box.BOTTOM - 1e-3), half_extents=(80e-3, 40e-3, 1e-3), friction=floor.friction)
-    return wy.Simulator(wy.Scene(cloths, obstacles=[table, slab, *walls]), step=trajectory.step).run(0)
+    far = box.PLACE[0] + 0.5 * box.INNER
+    half = 0.5 * (far + 2.0 * BESIDE)
+    slab = wy.Box(
+        center=(0.5 * far, 0, box.BOTTOM - 1e-3),
+        half_extents=(half, 0.5 * box.INNER + BESIDE, 1e-3),
+        friction=floor.friction,
+    )
+    return wy.Simulator(wy.Scene(cloths, obstacles=[top, slab, *walls]), step=trajectory.step).run(0)
 
 
 def plot(path: Path, found: Sequence[throws.Epoch]) -> None:

@@ -22,6 +22,8 @@ import warp_yarn as wy
 from warp_yarn.errors import integer
 
 GRAVITY = 9.8
+MORE = 1000
+"""Steps that what is beneath goes on after those of a run, for --resume."""
 SMALLER = 6
 """Yarns either way that the upper cloth has less than the lower one."""
 LAYERS = 2.5
@@ -50,9 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
+    if options.simulator is not None:
+        return touch.go_on(options)
     cloth = touch.flat(options)
     length = float(np.ptp(cloth.position, axis=0).max())
-    moved = way(options.acceleration, options.speed, options.step * np.arange(1, options.steps + 1))
+    moved = way(options.acceleration, options.speed, options.step * np.arange(1, options.steps + MORE + 1))
     along = moved[:, None] * np.array([0.0, 1.0, 0.0])
     floor = wy.Plane(point=(0, 0, 0), normal=(0, 0, 1), friction=options.friction)
     if options.beneath == "tray":

@@ -52,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> wy.Trajectory:
         SimulationError, KeyboardInterrupt: what ended the simulation, after the frames before it were written.
     """
     options = touch.parsed(parser(), arguments)
+    if options.simulator is not None:
+        return touch.go_on(options)
     layers, columns = integer("--layers", options.layers, least=2), integer("--columns", options.columns, least=3)
     profile = zigzag(columns, layers)
     options.columns = len(profile)

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from common import command
+from common import checked_counts, command
 
 import warp_yarn as wy
 from warp_yarn.errors import brief, integer
@@ -70,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> Ablation:
 def chosen(options: argparse.Namespace) -> tuple[wy.Scene, wy.State | None]:
     """The scene that the options name, and where it starts."""
     if options.file is None:
+        checked_counts(options, "size")
         size = 17 if options.size is None else options.size
         return paper.hung(FABRICS[options.fabric or "paper"](rows=size, columns=size)), None
     for name in ("fabric", "size"):

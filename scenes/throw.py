@@ -28,6 +28,7 @@ from common import (
     add_slowdown,
     add_weave,
     check_pictures,
+    checked_counts,
     command,
     file_ending,
     make_folders,
@@ -259,6 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     real("--within", options.within, least=0.0)
     make_folders([options.output, options.plot, options.result, options.png, options.mp4])
     check_pictures(options)
+    checked_counts(options, "size")
     cloth = woven_cloth(options.fabric, options, options.size, options.size, pose="flat")
     throw = Throw(
         cloth,

@@ -13,19 +13,21 @@ from common import (
     Run,
     add_length,
     add_pictures,
+    add_recording,
     add_weave,
     check_pictures,
+    checked_counts,
     draw,
     file_ending,
     make_folders,
     number_above,
+    resumed,
     settle_length,
     simulate,
     woven_cloth,
 )
 
 import warp_yarn as wy
-from warp_yarn.io.films import RECORDINGS
 from warp_yarn.io.usd import ENDINGS
 from warp_yarn.presets import paper
 from warp_yarn.presets.fabrics import FABRICS
@@ -55,8 +57,7 @@ def parser(text: str | None, name: str, *, rows: int, columns: int, steps: int) 
     add("--output", type=file_ending(*ENDINGS), default=output, metavar="USD", help="(%(default)s)")
     add("--tubes", action="store_true", help="yarns as meshes, for programs that do not draw curves")
     add_pictures(result)
-    text = "the frames as numbers (.npz, .h5), for wy.Trajectory.load"
-    add("--record", type=file_ending(*RECORDINGS), metavar="FILE", help=text)
+    add_recording(result)
     return result
 
 
@@ -68,9 +69,10 @@ def add_positive(parser: argparse.ArgumentParser, name: str, value: float, text:
 
 
 def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options, once it is known that all files can be written."""
+    """The options, once it is known that all files can be written; ``simulator`` is what --resume asks for."""
     options = of.parse_args(arguments)
-    settle_length(options, options.step)
+    options.simulator = resumed(options, arguments)
+    settle_length(options, options.step if options.simulator is None else options.simulator.step_size)
     make_folders([options.output, options.png, options.mp4, options.record])
     check_pictures(options)
     return options
@@ -78,6 +80,7 @@ def parsed(of: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argp
 
 def flat(options: argparse.Namespace) -> wy.Cloth:
     """The cloth of the options, flat, its middle in the origin."""
+    checked_counts(options, "rows", "columns")
     cloth = woven_cloth(options.fabric, options, options.rows, options.columns, pose="flat")
     return cloth.replace(pose=cloth.position - cloth.position.mean(axis=0))
 
@@ -108,6 +111,12 @@ def simulator(scene: wy.Scene, options: argparse.Namespace) -> wy.Simulator:
 def run(scene: wy.Scene, options: argparse.Namespace) -> Run:
     """Makes the steps, and writes them."""
     return simulate(simulator(scene, options), options, [options.output, options.record])
+
+
+def go_on(options: argparse.Namespace) -> wy.Trajectory:
+    """Makes the steps after those of the recording that --resume names, and ends as ``finish``."""
+    files = [options.output, options.record]
+    return finish(simulate(options.simulator, options, files, after=options.resume), options)
 
 
 def finish(run: Run, options: argparse.Namespace, *told: str) -> wy.Trajectory:

@@ -221,6 +221,23 @@ def force_a_gain(simulator: wy.Simulator) -> list[int]:
     return said
 
 
+def make_in_parts(simulator: wy.Simulator, steps: dict[int, tuple[int, float]]) -> None:
+    """Makes a simulator's method fail.
+
+    Args:
+        steps: since the beginning, from 0 on: with which status, and wherever more of it is tried than this [steps].
+    """
+    advance, arrays = simulator.integrator.advance, simulator.arrays
+
+    def attempt() -> None:
+        code, largest = steps.get(int(arrays["counters"].numpy()[1]), (0, np.inf))
+        if arrays["step_size"].numpy()[0] > largest * simulator.step_size:
+            arrays["status"].assign(np.array([code, -1, 0], dtype=np.int32))
+        advance()
+
+    simulator.integrator.advance = attempt
+
+
 def gain_in_a_part(simulator: wy.Simulator, size: float, left: float) -> list[float]:
     """Says of every part of this size, with so much of its step left [steps], that it gained energy, but of the
     fallback's; gives a list of them."""

@@ -9,6 +9,7 @@ from scripts import exit_code, load
 
 import warp_yarn as wy
 from warp_yarn.simulation.packing import SHAPES
+from warp_yarn.simulation.state import FIELDS
 from warp_yarn.view import geometry
 
 touch = load("scenes/touch.py")
@@ -92,6 +93,38 @@ def test_the_look_finds_what_is_too_near(usd):
 
 
 # -- scenes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+@pytest.mark.parametrize("name", SCENES)
+def test_a_resumed_run_is_the_uninterrupted_one(name, ending, usd, tmp_path):
+    """To the last bit; what is pulled away goes on, and is not stopped where the recording ended."""
+    size, record = {"rows": 10, "columns": 10}, tmp_path / f"a{ending}"
+    own = {"pull": ["--beneath", "cloth"], "stack": ["--layers", 2], "fold": ["--fold", 4]}.get(name, [])
+    main = SCENES[name].main
+    whole = main(small(usd, "--steps", 6, *own, **size))
+    main(small(usd, "--steps", 4, "--record", record, *own, **size))
+    both = main(["--resume", str(record), "--steps", "2", "--output", str(usd), "--record", str(record)])
+    for part in FIELDS:
+        np.testing.assert_array_equal(getattr(both, part), getattr(whole, part))
+    assert wy.Trajectory.load(record) == both and Usd.Stage.Open(str(usd)).GetEndTimeCode() > 0.0
+
+
+def test_a_recording_settles_what_the_scene_is(usd, tmp_path, capsys):
+    record = tmp_path / "a.npz"
+    drape.main(small(usd, "--steps", 1, "--record", record))
+    for option in (["--over", "box"], ["--rows", "7"], ["--rows=7"], ["--friction", "0.3"], ["--step", "1e-3"]):
+        assert exit_code(drape, ["--resume", str(record), "--output", str(usd), *option]) == 2
+        assert f"{option[0].partition('=')[0]} does not go with --resume" in capsys.readouterr().err
+
+
+def test_a_fold_that_was_not_let_go_is_not_resumed(usd, tmp_path, capsys):
+    record = tmp_path / "a.npz"
+    cloth = touch.flat(touch.parser(None, "fold", rows=5, columns=5, steps=1).parse_args([]))
+    pins, path = fold.carried(cloth, 3)
+    wy.Simulator(wy.Scene(cloth, pins=pins, pin_path=path)).run(1).save(record)
+    assert exit_code(fold, ["--resume", str(record), "--output", str(usd)]) == 2
+    assert "ended within the fold" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "sdirk2"])

@@ -1,11 +1,15 @@
 """Forces that a test reads: what pins give, by balances of momentum and energy, the strip test, and the work done."""
 
+import dataclasses
 import functools
+import re
+import warnings
 
 import numpy as np
 import pytest
 from cases import quick
-from internals import room_for_near
+from internals import make_in_parts, room_for_near
+from warp_yarn.kernels.core.status import GAINED, STALLED
 
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
@@ -132,7 +136,7 @@ def test_steps_that_follow_their_error_too():
 
 def test_a_step_that_ends_elsewhere_is_not_known():
     simulator, trajectory = released(None)
-    other = wy.Trajectory(trajectory.cloth, trajectory.step, *(getattr(trajectory, n).copy() for n in NAMES))
+    other = wy.Trajectory(trajectory.cloth, trajectory.step, *(getattr(trajectory, n)[:2].copy() for n in NAMES))
     other.position[1, 5] += 1e-3
     with pytest.warns(wy.WarpYarnWarning, match="step 1 was made in parts, which cannot be made again"):
         assert np.isnan(simulator.reactions(other)[0]).all()
@@ -295,6 +299,70 @@ def test_frames_that_are_not_those_of_steps_are_refused():
     np.testing.assert_array_equal(simulator.reactions(trajectory[2:5]), simulator.reactions(trajectory)[2:4])
 
 
+FABRICS = {"paper": wy.paper.cloth, "handkerchief": wy.fabrics.handkerchief, "cotton": wy.fabrics.cotton}
+PARTED = {"split": STALLED, "damped": GAINED}
+
+
+@pytest.mark.parametrize("method", ["linear", "implicit-euler", "sdirk2"])
+@pytest.mark.parametrize("fabric", FABRICS)
+@pytest.mark.parametrize("how", PARTED)
+@pytest.mark.parametrize("stiffness", [1e4, None], ids=["springs", "exact"])
+def test_steps_in_parts_are_not_taken_for_one(stiffness, how, fabric, method):
+    """What the simulator knows that made them, none other does; it is told what may be wrong, or is right."""
+    if how == "damped" and INTEGRATORS[method].fallback is None:
+        pytest.skip("makes no step again")
+    scene = moved(stiffness, fabric=FABRICS[fabric])
+    maker, other = (wy.Simulator(scene, integrator=method) for _ in range(2))
+    make_in_parts(maker, {3: (PARTED[how], 0.6)})
+    trajectory = maker.run(6)
+    assert 4 in maker.split_steps and bool(maker.damped_steps) == (how == "damped")
+    right = maker.reactions(trajectory)
+    found, doubt = doubted(other, trajectory)
+    if how == "damped" or (stiffness is None and fabric != "paper"):
+        assert found is None
+    elif not doubt:
+        # soft yarns' steps come out much the same in parts and at once; an iteration more is not all of the way
+        off = np.abs(found - right).max(axis=(1, 2)) / np.abs(right).max(axis=(1, 2))
+        assert fabric == "paper" and off.max() < 0.06
+
+
+def doubted(simulator: wy.Simulator, trajectory: wy.Trajectory) -> tuple[np.ndarray | None, str]:
+    """Reactions, None where they are refused, and what is said against them."""
+    told = r"step \d of the trajectory does not solve .* Ask who made it: .*simulator\.split_steps"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            found = simulator.reactions(trajectory)
+        except wy.InputError as error:
+            assert re.match(told, str(error)) and "no step of this simulator" in str(error)
+            return None, str(error)
+    assert all(re.match(told, str(warning.message)) for warning in caught)
+    return found, str(caught[0].message) if caught else ""
+
+
+@pytest.mark.parametrize("fabric", FABRICS)
+@pytest.mark.parametrize("method", ["linear", "implicit-euler", "sdirk2"])
+def test_frames_of_another_method_step_or_wind_are_refused(method, fabric):
+    scene = moved(None, fabric=FABRICS[fabric], wind=wy.Wind(velocity=(0, 5, 0)))
+    trajectory = wy.Simulator(scene, integrator=method).run(6)
+    windy = scene.replace(wind=wy.Wind(velocity=(0, 15, 0)))
+    others = {name: wy.Simulator(scene, integrator=name) for name in ("linear", "implicit-euler", "sdirk2")}
+    others["shorter"] = wy.Simulator(scene, integrator=method, step=5e-4)
+    others["wind"] = wy.Simulator(windy, integrator=method)
+    assert np.isfinite(others.pop(method).reactions(trajectory)).all()
+    # a recording of an older warp_yarn does not say what made it; its equations do
+    bare = dataclasses.replace(trajectory, options=None, scene=None)
+    for name, simulator in others.items():
+        what = {"shorter": r"trajectory\.step", "wind": r"trajectory\.scene is another"}.get(name, "made by integrator")
+        with pytest.raises(wy.InputError, match=what):
+            simulator.reactions(trajectory)
+        frames = dataclasses.replace(bare, step=5e-4) if name == "shorter" else bare
+        found, doubt = doubted(simulator, frames)
+        assert doubt
+        # methods of order 1 are near to each other on soft yarns
+        assert found is None or fabric == "paper"
+
+
 @pytest.mark.parametrize("chunk", [1, 4])
 def test_reactions_as_frames_come(chunk):
     """The last step is that before the frame, or the one that it lies in."""
@@ -417,6 +485,14 @@ def test_reactions_in_single_precision_are_near_or_say_so():
     simulator.run(2)
     with pytest.warns(wy.WarpYarnWarning, match=r"single precision are rounded .* precision='double'"):
         simulator.reactions()
+
+
+def test_frames_in_single_precision_are_told_to_be_rough_and_not_refused():
+    """Rounding may be all that stiff yarns give: its own frames do not solve its equations."""
+    simulator = wy.Simulator(moved(None, fabric=wy.fabrics.cotton), precision="single", integrator="implicit-euler")
+    trajectory = simulator.run(8)
+    with pytest.warns(wy.WarpYarnWarning, match=r"step \d of the trajectory does not solve .* precision='double'"):
+        assert np.isfinite(simulator.reactions(trajectory)).all()
 
 
 @pytest.mark.parametrize("ask", ["reactions", "forces", "energy", "system"])

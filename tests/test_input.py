@@ -5,9 +5,11 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_yarn as wy
 
@@ -240,7 +242,10 @@ CLOTH_OF_MANY = wy.paper.cloth(rows=20, columns=20)
     ("call", "shown"),
     [
         (lambda big: wy.write_usd("a.usdc", big), "trajectory = an array of shape (400, 3), must be a Trajectory"),
-        (lambda big: wy.write_usd("a.usdc", wy.State(big, big, big, big)), "trajectory = an object of type State"),
+        (
+            lambda big: wy.write_usd("a.usdc", wy.State(big, big, big, big)),
+            "trajectory = State(400 nodes), must be a Trajectory",
+        ),
         (lambda big: wy.write_usd("a.usdc", [big]), "trajectory = an object of type list"),
         (lambda big: wy.write_usd("a.usdc", "x" * 5000), "xxx…, must be a Trajectory"),
         (lambda big: wy.Simulator(big), "scene = an array of shape (400, 3), must be a Scene"),
@@ -277,6 +282,87 @@ def test_warp_starts_without_a_banner():
     told = ran.stderr.splitlines()
     assert told[-2:] == ["wanted", "also wanted"]
     assert not told[:-2] or ctypes_finds_cuda()
+
+
+LEVELS = {
+    "nobody asks": ("", "", False, wp.LOG_WARNING),
+    "asked for after the import": ("", "wp.config.log_level = wp.LOG_INFO", True, wp.LOG_INFO),
+    "asked for more before": ("wp.config.log_level = wp.LOG_DEBUG", "", True, wp.LOG_DEBUG),
+    "asked for less before": ("wp.config.log_level = wp.LOG_ERROR", "", False, wp.LOG_ERROR),
+}
+
+
+@pytest.mark.parametrize("name", LEVELS)
+def test_modules_are_loaded_without_a_word_until_somebody_asks(name):
+    before, after, told, level = LEVELS[name]
+    code = (
+        f"import warp as wp\n{before}\nimport warp_yarn as wy\n{after}\n"
+        "wy.Simulator(wy.paper.hung_cloth(rows=3, columns=3)).run(1)\nprint('LEVEL', wp.config.log_level)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert ran.returncode == 0
+    assert ("Module warp_yarn" in ran.stdout + ran.stderr) == told
+    if not told:
+        assert len(ran.stdout.splitlines()) == 1
+    assert f"LEVEL {level}" in ran.stdout
+
+
+NAMES = {
+    "fabric": (
+        lambda: wy.fabrics.FABRICS["denym"],
+        KeyError,
+        "fabric = 'denym', must be one of paper, .*; near: denim",
+    ),
+    "fabric's attribute": (
+        lambda: wy.fabrics.kevlar,
+        AttributeError,
+        "fabric = 'kevlar', must be .*; near: kevlar_s706",
+    ),
+    "nothing near": (lambda: wy.fabrics.xyz, AttributeError, "fabric = 'xyz', must be one of .* glass_7628$"),
+    "weave": (lambda: wy.WEAVES["plian"], KeyError, "weave = 'plian', must be one of plain, twill, satin; near: plain"),
+    "fibre": (lambda: wy.FIBRES["cottn"], KeyError, "fibre = 'cottn', must be one of cotton, .*; near: cotton"),
+    "fibre of a yarn": (lambda: wy.Yarn.from_tex(20, "cottn"), ValueError, "fibre = 'cottn', must .*; near: cotton"),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_that_are_not_there_tell_which_are_near(name):
+    call, kind, message = NAMES[name]
+    with pytest.raises(wy.InputError, match=message) as error:
+        call()
+    assert isinstance(error.value, kind)
+
+
+def test_names_stay_a_dictionary_and_a_module():
+    assert wy.fabrics.FABRICS.get("denym") is None and "denym" not in wy.fabrics.FABRICS
+    assert not hasattr(wy.fabrics, "denym") and not hasattr(wy.fabrics, "__path__")
+    for names in (wy.FIBRES, wy.WEAVES):
+        again = pickle.loads(pickle.dumps(names))
+        assert again == names and again.what == names.what
+
+
+def test_what_can_be_resumed_is_told():
+    told = r"must be a Trajectory or end in \.npz, \.h5, \.hdf5: .* record\(\.\.\.\)"
+    for path in ("a.usdc", "film.mp4", Path("a.PNG")):
+        with pytest.raises(wy.InputError, match=told):
+            wy.Simulator.resumed(path)
+
+
+@pytest.mark.parametrize("view", ["top", (0, 0), (0, 0, 0)])
+def test_what_a_view_may_be_is_told(view, tmp_path):
+    trajectory = wy.Simulator(wy.paper.hung_cloth(rows=3, columns=3)).run(1)
+    with pytest.raises(wy.InputError, match=r"view .*: 3 numbers, .* such as \(0, 0, 1\) from the top"):
+        wy.write_png(tmp_path / "a.png", trajectory, view=view)
+
+
+def test_states_and_trajectories_are_told_in_a_line():
+    trajectory = wy.Simulator(wy.paper.hung_cloth(rows=3, columns=4)).run(2)
+    assert repr(trajectory[0]) == "State(12 nodes)"
+    cloth = "Cloth(Weave(plain, 3 × 4), 2 yarns, spacing 0.001 m)"
+    assert repr(trajectory) == f"Trajectory(3 frames of 12 nodes, 0.001 s apart, {cloth})"
+    other = trajectory.cloth.replace(pose=trajectory.cloth.position + 1.0)
+    both = wy.Simulator(wy.Scene([trajectory.cloth, other])).run(0)
+    assert repr(both) == f"Trajectory(1 frame of 24 nodes, 0.001 s apart, Cloths({cloth}, {cloth}))"
 
 
 def ctypes_finds_cuda() -> bool:

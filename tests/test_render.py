@@ -1,5 +1,6 @@
 """Pictures and movies: their size, their colours, that everything is in view, and that movies move."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -96,6 +97,49 @@ def test_pictures_of_a_camera_that_stays_differ_where_the_cloth_is(tmp_path):
 def moved(trajectory, by):
     trajectory.position = trajectory.position + by
     return trajectory
+
+
+SIDE = 1e-2
+NEAR_BY = {
+    "sphere": wy.Sphere(center=(0.02, 0.0, 0.04), radius=SIDE),
+    "box": wy.Box(center=(0.03, 0.01, 0.04), half_extents=(SIDE, 2e-3, 2e-3)),
+    "capsule": wy.Capsule(start=(0.03, 0.0, 0.045), end=(0.03, 0.01, 0.05), radius=2e-3),
+    "cylinder": wy.Cylinder(start=(0.0, 0.0, 0.04), end=(0.01, 0.0, 0.04), radius=2e-3),
+    "mesh": wy.TriangleMesh(SIDE * np.eye(3), [[0, 1, 2]], position=(0.01, -0.01, 0.03)),
+    "moving": wy.Sphere(center=(0.02, 0.0, 0.05), radius=2e-3, path=[(0.03, 0.0, 0.05)]),
+}
+"""Beside a cloth of 5 mm, which they are up to 20 mm away from."""
+
+
+@pytest.mark.parametrize("name", NEAR_BY)
+def test_what_is_no_plane_is_in_the_picture_whole(name):
+    """Its corners are in the picture of a camera that was not given, by the rule of three; and fill more of it."""
+    trajectory = waving()
+    alone = wy.steady_camera(trajectory, size=SIZE)
+    trajectory.scene = wy.Scene(trajectory.cloth, obstacles=[NEAR_BY[name]])
+    found = wy.steady_camera(trajectory, size=SIZE)
+    assert found.distance > 1.05 * alone.distance
+    high = np.tan(np.radians(0.5 * found.lens))
+    for each in geometry.placed(trajectory):
+        x, y, toward = np.moveaxis(found.seen(each.world(each.corners())), -1, 0)
+        ahead = found.distance - toward
+        assert np.abs(x / ahead).max() < high * SIZE[0] / SIZE[1] and np.abs(y / ahead).max() < high
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        wy.Plane(point=(0, 0, 0.0), normal=(0, 0, 1)),
+        wy.Box(center=(0, 0, -1.0), half_extents=(1.0, 1.0, 1.0)),
+        wy.Sphere(center=(1.0, 0, 0), radius=1e-3),
+    ],
+    ids=["plane", "table of 2 m", "ball at 1 m"],
+)
+def test_what_would_leave_the_cloth_too_small_is_not(obstacle):
+    trajectory = waving()
+    alone = wy.steady_camera(trajectory, size=SIZE)
+    trajectory.scene = wy.Scene(trajectory.cloth, obstacles=[obstacle])
+    assert wy.steady_camera(trajectory, size=SIZE).distance < 2.0 * alone.distance
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -255,7 +299,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, write, 
     last = 0 if name == "a.png" else 1
     monkeypatch.setattr(Picture, "drawn", lambda self, k: fails() if k == last else drawn(self, k))
     with pytest.raises(OSError, match="no space left"):
-        write(tmp_path / name, waving(frames=8), size=SIZE)
+        write(tmp_path / name, waving(frames=101), size=SIZE)
     assert os.listdir(tmp_path) == [name]
     assert (tmp_path / name).read_bytes() == b"precious"
 
@@ -343,6 +387,19 @@ def test_nothing_of_it_is_imported_before_it_is_needed(tmp_path):
     code = "import sys, warp_yarn; sys.exit(any(m in sys.modules for m in ('viser', 'imageio')))"
     # elsewhere than in the checkout, whose warp_yarn/ would hide the installed one
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
+
+
+def test_movies_and_usd_files_have_the_same_names_and_defaults(tmp_path):
+    """And say how slow they are: a second of a movie without a slowdown is one of the simulation."""
+    of_movie, of_usd = (inspect.signature(write).parameters for write in (wy.write_mp4, wy.write_usd))
+    same = {name: parameter.default for name, parameter in of_movie.items() if name in of_usd}
+    assert {"fps": 24.0, "slowdown": 1.0, "selvedge": False}.items() <= same.items()
+    assert same == {name: of_usd[name].default for name in same}
+    trajectory = waving(frames=101)
+    wy.write_mp4(tmp_path / "a.mp4", trajectory, size=(64, 48))
+    with imageio.get_reader(tmp_path / "a.mp4") as reader:
+        assert reader.count_frames() == 3  # at 0, 1/24 and 2/24 s, of 0.1 s
+    assert b"One second of simulated time takes 1 s to play" in (tmp_path / "a.mp4").read_bytes()
 
 
 def test_the_old_name_of_a_movie_s_rate(tmp_path):

@@ -116,6 +116,59 @@ def test_counts_of_yarns_are_warned_of_alike():
         wy.Yarn.from_tex(3e4)
 
 
+def apart(distance: float) -> wy.Scene:
+    """Two cloths whose edges are sewn together, so many spacings apart."""
+    upper = wy.fabrics.handkerchief(rows=4, columns=4, pose="flat")
+    lower = upper.replace(pose=upper.position + np.array([0.0, (3.0 + distance) * upper.spacing, 0.0]))
+    return wy.Scene([upper, lower], seams=[[upper.node(-1, k), upper.nodes + lower.node(0, k)] for k in range(4)])
+
+
+def carried(first: float, later: float = 0.1, steps: int = 5) -> wy.Scene:
+    """A cloth whose pins move so many spacings in the first step, and in each later one."""
+    cloth = wy.fabrics.handkerchief(rows=4, columns=4)
+    way = cloth.spacing * (first + later * np.arange(steps))
+    path = cloth.position[[0, 3]] + way[:, None, None] * np.array([0.0, 0.6, 0.8])
+    return wy.Scene(cloth, pins=[0, 3], pin_path=path)
+
+
+def rolling(first: float, later: float = 0.1, steps: int = 5) -> wy.Scene:
+    """The same of a ball."""
+    cloth = wy.fabrics.handkerchief(rows=4, columns=4)
+    way = cloth.spacing * (first + later * np.arange(steps))
+    center = np.array([0.0, 0.0, -0.1])
+    balls = [wy.Sphere(center=center, radius=0.01, path=center + way[:, None] * [1.0, 0.0, 0.0])]
+    return wy.Scene(cloth, obstacles=[wy.Plane(point=(0, 0, -1), normal=(0, 0, 1)), *balls])
+
+
+FAR = {
+    "seams": (lambda: apart(20.0), r"seams\[0\] = \[12, 16\] are 0.02 m apart at the start, 20 spacings: .* pin_path"),
+    "pins": (lambda: carried(8.0), r"pin_path begins 0.008 m from its pins, 8 spacings: a jump .* begin"),
+    "pins at once": (lambda: carried(8.0, steps=1), r"pin_path begins 0.008 m from its pins, 8 spacings"),
+    "obstacle": (lambda: rolling(8.0), r"path of obstacles\[1\] begins 0.008 m from it, 8 spacings: a jump"),
+}
+NEAR = {
+    "seams": lambda: apart(1.1),
+    "pins": lambda: carried(1.0),
+    "pins that fly": lambda: carried(8.0, 8.0),
+    "obstacle": lambda: rolling(1.0),
+    "a ball that flies": lambda: rolling(8.0, 8.0),
+}
+
+
+@pytest.mark.parametrize("name", FAR)
+def test_what_is_far_at_the_start_is_warned_of(name):
+    make, message = FAR[name]
+    with pytest.warns(wy.WarpYarnWarning, match=message) as caught:
+        make()
+    assert len(caught) == 1 and caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("make", NEAR.values(), ids=NEAR)
+@pytest.mark.filterwarnings("error")
+def test_what_is_near_is_not(make):
+    make()
+
+
 PLANE = {"point": (0, 0, 0), "normal": (0, 0, 1)}
 THINGS = {
     "weave": (lambda: wy.Weave.plain(rows=4, columns=4), "name", "other"),

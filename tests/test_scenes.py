@@ -388,6 +388,14 @@ def test_a_recording_settles_cloth_and_step(usd, tmp_path, capsys):
         assert option[0] in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "scene, option", [("hang", "--size"), ("hang", "--rows"), ("throw", "--size"), ("drape", "--rows")]
+)
+def test_too_few_yarns_are_told_by_the_option(scene, option, capsys):
+    assert exit_code(load(f"scenes/{scene}.py"), [option, "2"]) == 2
+    assert f"{option} = 2, must be a whole number, at least 3" in capsys.readouterr().err
+
+
 def test_a_failing_simulation_leaves_the_frames_before_it(usd, monkeypatch, capsys):
     a_step_at_a_time(monkeypatch)
     run = wy.Simulator.run_chunk
@@ -432,12 +440,12 @@ def test_ctrl_c_leaves_the_finished_frames(usd, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--size", "2"], "rows = 2"),
+        (["--size", "2"], "--size = 2"),
         (["--columns", "-4"], "columns = -4"),
         (["--size", "five"], "--size"),
         (["--weave", "knit"], "--weave"),
         (["--fabric", "felt"], "--fabric"),
-        (["--fabric", "cotton", "--size", "2"], "rows = 2"),
+        (["--fabric", "cotton", "--size", "2"], "--size = 2"),
         (["--fabric", "cotton", "--yarns", "1", "2"], "--yarns = 1 2"),
         (["--yarns", "1", "1"], "yarns = 1 1"),
         (["--yarns", "1", "9"], "yarns = 1 9"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from inputs import GROUPS, cloth, colliding, jittered, scaled, scene_for
-from internals import gain_in_a_part, numbers, strips
+from internals import gain_in_a_part, make_in_parts, numbers, strips
 from warp_yarn.kernels.core.status import GAINED, STALLED
 
 import warp_yarn as wy
@@ -18,23 +18,6 @@ STEPS = 4
 CASES = {**GROUPS, "exact pins": ("pin_path", "stretch", "position", "velocity", "forces")}
 EXACT = {"tolerance": 1e-14, "newton_tolerance": 1e-13}
 """Iterations to rounding: what they leave is noise of the differences."""
-
-
-def make_in_parts(simulator: wy.Simulator, steps: dict[int, tuple[int, float]]) -> None:
-    """Makes a simulator's method fail.
-
-    Args:
-        steps: since the beginning, from 0 on: with which status, and wherever more of it is tried than this [steps].
-    """
-    advance, arrays = simulator.integrator.advance, simulator.arrays
-
-    def attempt() -> None:
-        code, largest = steps.get(int(arrays["counters"].numpy()[1]), (0, np.inf))
-        if arrays["step_size"].numpy()[0] > largest * simulator.step_size:
-            arrays["status"].assign(np.array([code, -1, 0], dtype=np.int32))
-        advance()
-
-    simulator.integrator.advance = attempt
 
 
 HALVED = {1: (STALLED, 0.6), 2: (STALLED, 0.3)}

@@ -107,7 +107,7 @@ def test_an_interrupted_search_writes_the_best_throw_so_far(usd, monkeypatch):
         (["--rate", "0"], "--rate"),
         (["--within", "-1"], "--within"),
         (["--checkpoint-every", "0"], "checkpoint_every"),
-        (["--size", "2"], "rows = 2"),
+        (["--size", "2"], "--size = 2"),
         (["--weave", "felt"], "felt"),
         (["--output", "throw.obj"], "throw.obj"),
         (["--plot", "throw.pdf"], "throw.pdf"),

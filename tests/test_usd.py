@@ -706,6 +706,22 @@ def test_a_cloth_far_away_keeps_its_shape(tmp_path, tubes, offset):
             assert (low <= points.min(axis=0) + SINGLE).all() and (high >= points.max(axis=0) - SINGLE).all()
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
+def test_velocities_are_as_exact_far_away(tmp_path, tubes, offset):
+    """Differences are taken where positions are fine enough for them."""
+    trajectory = waving(frames=1)
+    spin = np.array([3.0, -40.0, 15.0])
+    trajectory.velocity = np.cross(spin, trajectory.position)
+    _stage, near = written(tmp_path / "near.usdc", trajectory, tubes=tubes)
+    trajectory.position = trajectory.position + offset
+    _far, far = written(tmp_path / "far.usdc", trajectory, tubes=tubes)
+    # of 0.3 m/s; positions at 1e6 m are rounded by 1e-10 m, of yarns of 3e-4 m that turn by that over their half height
+    bound = 1e-6 + 1e-9 * offset
+    for name, shape in far.items():
+        expected = near[name].GetVelocitiesAttr().Get(0)
+        np.testing.assert_allclose(shape.GetVelocitiesAttr().Get(0), expected, rtol=0, atol=bound)
+
+
 def test_a_cloth_that_moves_far_is_followed(tmp_path, tubes):
     """From the origin to 100 km away: no one translation is near to all of it."""
     trajectory, still = waving(), waving()

@@ -16,6 +16,7 @@ from .description.pieces import piece
 from .description.scene import Scene, Wind
 from .description.weave import WEAVES, Weave
 from .description.yarn import Yarn
+from .device import start
 from .errors import (
     GradientError,
     InputError,
@@ -40,6 +41,7 @@ from .view.drawdown import write_drawdown
 from .view.render import steady_camera, write_mp4, write_png
 
 moved.install()
+start.be_quiet()
 
 __version__ = importlib.metadata.version("warp_yarn")
 

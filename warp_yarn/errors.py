@@ -1,15 +1,17 @@
 """What can go wrong, as exceptions that say where, with which value, and what is allowed."""
 
+import difflib
 import functools
 import importlib.metadata
 import re
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 
 from .moved import renamed
 
+T = TypeVar("T")
 LONGEST = 200
 """Characters of a value in a message."""
 
@@ -24,6 +26,12 @@ class InputError(WarpYarnError, ValueError):
 
 class NoAttributeError(InputError, AttributeError):
     """An attribute that cannot be had, or cannot be set."""
+
+
+class NoNameError(InputError, KeyError):
+    """A name that nothing has. The message tells which there are, and which are near."""
+
+    __str__ = Exception.__str__  # a KeyError's is its repr
 
 
 class SimulationError(WarpYarnError, RuntimeError):
@@ -115,8 +123,41 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
     """Gives value, or an InputError where it is none of the allowed names."""
     names = list(allowed)
     if value not in names:
-        raise InputError(f"{name} = {brief(value)}, must be one of {', '.join(names)}")
+        raise InputError(_of_names(name, value, names))
     return value
+
+
+def _of_names(name: str, value: Any, names: list[str]) -> str:
+    """Tells which names are allowed, and which are near to a value that is none."""
+    near = difflib.get_close_matches(value, names) if isinstance(value, str) else []
+    return f"{name} = {brief(value)}, must be one of {', '.join(names)}" + (
+        f"; near: {', '.join(near)}" if near else ""
+    )
+
+
+class Named(dict[str, T]):
+    """Things by name, which tells the names that are near to one that is not there.
+
+    Args:
+        what: they are.
+        things: by name.
+    """
+
+    def __init__(self, what: str, things: Mapping[str, T]):
+        super().__init__(things)
+        self.what = what
+
+    def __missing__(self, name: Any) -> T:
+        raise NoNameError(_of_names(self.what, name, list(self)))
+
+    def attribute(self, name: str) -> T:
+        """Gives one by its name, as an attribute of a module that has them; or a NoAttributeError."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except NoNameError as error:
+            raise NoAttributeError(str(error)) from None
 
 
 def indices(name: str, value: Any, count: int, what: str) -> np.ndarray:

@@ -71,8 +71,9 @@ class Cloth(Places):
             crossing, 2 √(k_f m), m the mean mass of a yarn's part at a crossing.
         friction_sharpness: p of eq. 4, how sharply a crossing breaks away, above 0.
         parallel_stiffness: k_c, repulsion of parallel yarns [N/m], at least 0.
-        pose: "upright", (x, 0, height − y) of a node x along u and y along v from the first one; "flat", (x, y, 0); or
-            positions, nodes × 3 [m].
+        pose: "upright", (u, 0, height − v) of a node u along the warp and v along the weft from the first one: u points
+            to the right, along x, and v down, along −z, so that an outline hangs with its large v below; "flat",
+            (u, v, 0); or positions, nodes × 3 [m].
         outline: what is cut out of the rectangle: the corners of a polygon (u, v) [n, 2] (m), in its plane at rest,
             (0, 0) being its first node; None: all of it. See ``cut``.
         holes: polygons that are cut out of that, apart from it and from each other.

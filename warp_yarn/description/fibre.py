@@ -8,7 +8,7 @@ import math
 import warnings
 from collections.abc import Mapping
 
-from ..errors import InputError, WarpYarnWarning, choice, real
+from ..errors import InputError, Named, WarpYarnWarning, choice, real
 from .fixed import Replaceable, says_why
 
 TIGHTEST = math.pi / math.sqrt(12.0)
@@ -61,7 +61,7 @@ def check_packing(packing: float) -> float:
 _HEARLE = "Morton & Hearle, Physical Properties of Textile Fibres (as remembered)"
 _FINE = "fineness usual"
 
-FIBRES = {
+FIBRES = Named("fibre", {
     "cotton": Fibre(density=1520, modulus=6.5, flexural=0.53, tex=0.17, source=f"{_HEARLE}; 5 to 8 N/tex; {_FINE}"),
     "viscose": Fibre(density=1520, modulus=6.5, flexural=0.35, tex=0.17, source=f"{_HEARLE}; {_FINE}"),
     "wool": Fibre(density=1310, modulus=2.7, flexural=0.24, tex=0.41, source=f"{_HEARLE}; 2.1 to 3.4 N/tex; {_FINE}"),
@@ -85,7 +85,7 @@ FIBRES = {
         density=1440, modulus=58.75, flexural=3.25, tex=0.167, packing=0.75,
         source="Cheng 2005, as quoted by others: 84.6 GPa, 1440 kg/m³, 12 µm; flexural of a round rod",
     ),
-}  # fmt: skip
+})  # fmt: skip
 """Fibres by name. Their numbers are typical of their kind, but for Kevlar's, which were measured."""
 
 Spun = str | Fibre | Mapping[str, float]

@@ -20,7 +20,9 @@ def piece(
     Args:
         fabric: a function of rows and columns that makes a cloth with one distance between its warp and one between its
             weft yarns, such as ``wy.fabrics.cotton``.
-        outline: the corners of a polygon (u, v) [n, 2] (m), anywhere in the plane, such as ``wy.outline.disc(0.1)``.
+        outline: the corners of a polygon (u, v) [n, 2] (m), anywhere in the plane, such as ``wy.outline.disc(0.1)``. In
+            the pose "upright", which is the default, v points down: what was drawn with v up hangs upside down, unless
+            (u, −v) is given. With ``pose="flat"`` u is x and v is y.
         holes: polygons in it.
         coarsened: n, yarns to one: ``Cloth.coarsened``.
         options: of the fabric.

@@ -1,4 +1,5 @@
-"""Numbers that can be used and are likely given in another unit than SI: a warning that says which."""
+"""Numbers that can be used and are likely not meant, in another unit than SI or far from where the cloth is: a warning
+that says which."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from ..errors import WarpYarnWarning, real
 
 if TYPE_CHECKING:
     from .cloth import Cloth
+    from .scene import Scene
 
 DISTANCE = (1e-5, 5e-2)
 """Of neighbouring yarns that anyone weaves or stands for others by [m]: from fine filaments to nets."""
@@ -27,6 +29,9 @@ SPEED = 350.0
 """Of wind [m/s], beyond sound: 10 m/s are 1000 cm/s."""
 STEP = 0.2
 """Of time [s]: films have 24 frames a second; longer steps look for equilibrium."""
+
+FAR = 3.0
+"""In spacings: from how far on what is drawn together, or moved, in the first step is not near."""
 
 
 def warn_of_units(cloth: Cloth) -> None:
@@ -77,6 +82,43 @@ def warn_of_speed(velocity: Any) -> None:
     if not callable(velocity):
         speed = np.linalg.norm(np.reshape(velocity, (-1, 3)), axis=1)
         _check("wind velocity", speed, (0.0, SPEED), "m/s", "in m/s")
+
+
+def warn_of_distances(scene: Scene) -> None:
+    """Warns where seams, or the first places of pins and obstacles on their paths, are far from where they start."""
+    spacing = scene.cloth.longest_spacing
+    for begin, distance, where, advice in _distances(scene):
+        text = f"{begin} {distance:.3g} m {where}, {distance / spacing:.3g} spacings: {advice}"
+        warnings.warn(text, WarpYarnWarning, stacklevel=3)
+
+
+def _distances(scene: Scene) -> Iterator[tuple[str, float, str, str]]:
+    """Gives what is far, how far [m], from what, and what to do."""
+    cloth, near = scene.cloth, FAR * scene.cloth.longest_spacing
+    if len(scene.seams):
+        apart = np.linalg.norm(np.diff(cloth.position[scene.seams], axis=1)[:, 0], axis=1)
+        k = int(apart.argmax())
+        if apart[k] > near:
+            advice = (
+                "springs without length draw them together at once; give poses that meet there, or bring them there"
+            )
+            yield f"seams[{k}] = {scene.seams[k].tolist()} are", apart[k], "apart at the start", f"{advice} by pin_path"
+    moved = []
+    if scene.pin_path is not None and len(scene.pins):
+        moved.append(("pin_path", "its pins", cloth.position[scene.pins], scene.pin_path))
+    for k, obstacle in enumerate(scene.obstacles):
+        if obstacle.path is not None:
+            moved.append((f"the path of obstacles[{k}]", "it", obstacle.position[None], obstacle.path[:, None, :3]))
+    for name, what, start, path in moved:
+        way = np.linalg.norm(np.diff(np.concatenate([start[None], path]), axis=0), axis=2).max(axis=1)
+        # what is as fast later on is meant to be
+        if way[0] > max(near, FAR * way[1:].max(initial=0.0)):
+            yield (
+                f"{name} begins",
+                way[0],
+                f"from {what}",
+                "a jump in the first step; begin it where they start",
+            )
 
 
 def checked_step(step: Any) -> float:

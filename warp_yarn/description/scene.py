@@ -16,7 +16,7 @@ from .cloths import Cloths, as_one
 from .crimp import check_crimp
 from .fixed import Fixed, Replaceable, says_why
 from .obstacles import Contact, Obstacle
-from .sanity import warn_of_acceleration, warn_of_speed
+from .sanity import warn_of_acceleration, warn_of_distances, warn_of_speed
 from .seams import checked_seams
 from .selection import checked_parameters, selected_terms
 from .varying import checked_vectors, of_time
@@ -64,7 +64,7 @@ class Scene(Fixed):
         pins: nodes that are held, such as ``cloth.corners("top")``.
         pin_stiffness: k_h of a pin's spring [N/m], above 0, or None: held exactly.
         pin_path: where the pins are to be at the end of each step [steps, pins, 3] (m); they stay at the last place.
-            None: where the pose has them.
+            None: where the pose has them. A WarpYarnWarning says where its first step is a jump from there.
         forces: forces on nodes [N]: {node: 3 numbers, or steps × 3, or a function of time}. After its last step a force
             is 0; one that is given by 3 numbers does not end.
         sliding: whether yarns slide along each other. Without, nodes have 3 degrees of freedom, (u, v) stays at rest,
@@ -144,6 +144,7 @@ class Scene(Fixed):
         check_crimp(self.cloth, contact_force, self.crimp_interchange)
         self.terms = selected_terms(self, terms)
         warn_of_acceleration(self.gravity)
+        warn_of_distances(self)
         self._fix(
             cloth=self.cloth,
             gravity=self.gravity,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, choice, integer
+from ..errors import InputError, Named, choice, integer
 from . import notation
 from .fixed import Fixed
 
@@ -143,7 +143,7 @@ def _counts(rows: int, columns: int) -> tuple[int, int]:
     return rows, columns
 
 
-WEAVES = {"plain": Weave.plain, "twill": Weave.twill, "satin": Weave.satin}
+WEAVES = Named("weave", {"plain": Weave.plain, "twill": Weave.twill, "satin": Weave.satin})
 """The paper's weaves by name (figure 5)."""
 
 

@@ -1,4 +1,4 @@
-"""How Warp is started: without its banner, and without a warning of CUDA where there is none."""
+"""How Warp is started: without its banner, lines of modules, and a warning of CUDA where there is none."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ from .exclusive import ALONE
 NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
+def be_quiet() -> None:
+    """Leaves out what Warp tells by default, a banner and a line for each module that it loads, until somebody asks for
+    it: ``wp.config.log_level = wp.LOG_INFO`` after warp_yarn is imported. Another level stays as it is."""
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
+
+
 def device(name: Any) -> Any:
     """Gives a device of Warp, which this starts where nobody has."""
     with ALONE:
         if wp._src.context.runtime is None:
-            # whoever asks for more than the default is told
-            level = wp.LOG_WARNING if wp.config.log_level == wp.LOG_INFO else wp.config.log_level
-            with wp.ScopedLogLevel(level), without_line(NO_DRIVER, where=not _has_driver()):
+            with without_line(NO_DRIVER, where=not _has_driver()):
                 wp.init()
     return wp.get_device(name)
 

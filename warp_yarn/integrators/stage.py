@@ -137,8 +137,10 @@ class StageMethod:
         ]
 
     def assemble_made(self, stage: int) -> None:
-        """Assembles the right-hand side of a stage that was made, in place: what is left of it is the residual."""
-        self.newton.assemble(matrix=False)
+        """Assembles the matrix and the right-hand side of a stage that was made, in place: what is left of it is the
+        residual."""
+        self.model.arrays.zero("evaluations")
+        self.newton.assemble(matrix=True)
 
     def forget_graphs(self) -> None:
         """Captures anew, after arrays have changed their place."""

@@ -25,6 +25,7 @@ from .usd_prims import (
     Surface,
     TubeMesh,
     bind,
+    bounds,
     linear,
     material,
     vectors,
@@ -242,19 +243,18 @@ class Stage(Film):
             # whole where it is but for rounding, for programs that look at whole ones
             time = round(self.length * self.apart, 9)
             self._place(origin, time)
-            looks = [self.weaving.look(position)]
-            speed = float(np.abs(velocity).max())
-            if self.look["velocities"]:
-                # a ten thousandth of a yarn there and back: all that a point depends on is smooth over that
-                ahead = 1e-4 * self.weaving.strands[0].half.max() / max(speed, np.finfo(float).tiny)
-                looks += [self.weaving.look(position + way * ahead * velocity) for way in (1.0, -1.0) if speed > 0.0]
+            speed = float(np.abs(velocity).max()) if self.look["velocities"] else 0.0
+            # a millionth of a yarn: all that a point depends on is smooth over that
+            ahead = 1e-6 * self.weaving.strands[0].half.max() / max(speed, np.finfo(float).tiny)
+            # far from 0, positions are too coarse to be so little ahead
+            near = position - origin
+            looks = self.weaving.looks(np.stack([near, near + ahead * velocity] if speed > 0.0 else [near]))
             for shape in self.shapes:
                 points, *moved = [shape.points(*look) for look in looks]
                 self._unsaved += self._size(len(points))
-                write_points(shape.prim, time, points - origin, shape.margin)
+                write_points(shape.prim, time, points, shape.margin)
                 if self.look["velocities"]:
-                    twice = 2.0 * ahead * self.look["slowdown"]
-                    rate = (moved[0] - moved[1]) / twice if moved else np.zeros_like(points)
+                    rate = (moved[0] - points) / (ahead * self.look["slowdown"]) if moved else np.zeros_like(points)
                     shape.prim.GetVelocitiesAttr().Set(vectors(rate), time)
                 shape.slide(euler, time if self.slides else None)
         self.length += 1
@@ -340,9 +340,3 @@ def _origins(low: np.ndarray, high: np.ndarray, cloth: Cloth | Cloths) -> np.nda
         if max(np.abs(low - origin).max(), np.abs(high - origin).max()) <= reach:
             return np.broadcast_to(origin, (len(low), 3))
     return 0.5 * (low + high)
-
-
-def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the lowest and the highest coordinates [..., 3] of points [..., points, 3]."""
-    rows = np.ascontiguousarray(points.swapaxes(-1, -2))  # in which NumPy looks for them many times as fast
-    return rows.min(axis=-1), rows.max(axis=-1)

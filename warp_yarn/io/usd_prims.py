@@ -54,10 +54,12 @@ class Curves(Shape):
             self.prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
         self.margin = 0.5 * float(widths.max())
         self._repeated = strands.repeated
+        self._places, self._height = strands.places[self._repeated], strands.height[self._repeated, None]
         self._arc = _primvars(self.prim, strands, strands.arc[self._repeated], strands.yarn)
 
     def points(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return self.strands.points(places, normals)[self._repeated]
+        # as of the strands, but gathered once
+        return places.take(self._places, axis=0) + self._height * normals.take(self._places, axis=0)
 
     def slide(self, euler: np.ndarray, time: float | None) -> None:
         if time is not None:
@@ -173,10 +175,17 @@ def vectors(values: np.ndarray) -> Any:
     return Vt.Vec3fArray.FromNumpy(values.astype(np.float32))
 
 
+def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the lowest and the highest coordinates [..., 3] of points [..., points, 3]."""
+    rows = np.ascontiguousarray(points.swapaxes(-1, -2))  # in which NumPy looks for them many times as fast
+    return rows.min(axis=-1), rows.max(axis=-1)
+
+
 def write_points(shape: UsdGeom.PointBased, time: float, points: np.ndarray, margin: float) -> None:
     points = points.astype(np.float32)
     shape.GetPointsAttr().Set(vectors(points), time)
-    extent = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
+    low, high = bounds(points)
+    extent = np.stack([low - margin, high + margin])
     shape.GetExtentAttr().Set(vectors(extent), time)
 
 

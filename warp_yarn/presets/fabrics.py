@@ -13,6 +13,7 @@ from typing import Any
 
 from ..description.cloth import Cloth, Yarn
 from ..description.weave import Weave, woven
+from ..errors import Named
 from . import paper
 from .named import Datum, NamedFabric, derived, measured, typical
 
@@ -249,5 +250,6 @@ NAMED: dict[str, NamedFabric] = {name: each for name, each in globals().items() 
 """Those of data sheets, by name."""
 STUDIED: dict[str, Callable[..., Cloth]] = {"paper": paper.cloth, "handkerchief": handkerchief, "cotton": cotton}
 """The fabrics that charts and long tests go over: heavy and soft, light, light and stiff."""
-FABRICS: dict[str, Callable[..., Cloth]] = {**STUDIED, **NAMED}
+FABRICS: Named[Callable[..., Cloth]] = Named("fabric", {**STUDIED, **NAMED})
 """All fabrics by name: functions of rows, columns, weave and options of the Cloth."""
+__getattr__ = FABRICS.attribute

@@ -24,6 +24,8 @@ from .state import FIELDS, End, State, Trajectory
 from .stepper import Stepper
 from .substepping import Substepping
 
+SHOWN = (".usd", ".usda", ".usdc", ".usdz", ".mp4", ".png")
+"""How the names of files end that are made to be looked at."""
 DECIDING = (
     "step", "integrator", "precision", "preconditioner", "tolerance", "newton_tolerance", "max_iterations",
     "step_error", "energy_watch",
@@ -80,7 +82,7 @@ class Filming:
         fps: float | None = None,
         after: str | os.PathLike | None = None,
         precision: str = "double",
-        compression: int = 1,
+        compression: int = 0,
         progress: bool | None = False,
         **shown: Any,
     ) -> int:
@@ -151,6 +153,11 @@ class Filming:
             InputError: it has no scene, or cannot be read.
         """
         if not isinstance(recording, Trajectory):
+            if Path(recording).suffix.lower() in SHOWN:
+                raise InputError(
+                    f"recording = {str(recording)!r}, must be a Trajectory or end in {', '.join(RECORDINGS)}: what is "
+                    "made to be looked at has no state to go on from; name a recording in record(...) beside it"
+                )
             recording = Trajectory.load(recording, slice(-1, None))
         if recording.scene is None:
             raise InputError(

@@ -37,17 +37,20 @@ class Loads(Placing):
         They are computed when asked for, from the frames at both ends of a step.
 
         Args:
-            trajectory: frames of this simulator, with its present parameters; None: the last step.
+            trajectory: frames of this simulator, with its present parameters; None: the last step. Those of another one
+                of the same scene and options do too, if no step was made in parts, which only their maker knows.
 
         Returns:
             [pins, 3] (N), in the order of ``scene.pins``; of a trajectory [steps, pins, 3]. A step in parts is made
             again; NaN, with a WarpYarnWarning, where it ends elsewhere. A WarpYarnWarning too where spring pins that
-            are moved give way by over 1 % of their way.
+            are moved give way by over 1 % of their way, and where an iteration more on a step of a trajectory would
+            change its reactions by over 3 %: it was solved roughly, or is another simulator's.
 
         Raises:
             InputError: no step was made since the state was set, or what it had by ``set_inputs`` or
-                ``place_obstacles``; frames of another cloth or step, or not of every step; impact zones, which
-                have no forces; a registered integrator that is no StageMethod.
+                ``place_obstacles``; frames of another cloth, scene, method or step, or not of every step; a step that
+                is far from solving this simulator's equations, such as one of another's that was made in parts; impact
+                zones, which have no forces; a registered integrator that is no StageMethod.
         """
         steps = Steps(self.stepper, trajectory)
         return steps.shaped(reactions(steps))

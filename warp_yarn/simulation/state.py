@@ -40,6 +40,9 @@ class State:
     euler_velocity: np.ndarray
     anchor: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        return f"State({len(self.position)} nodes)"
+
     def __eq__(self, other: object) -> bool:
         """Tells whether two are the same, to the last bit."""
         if not isinstance(other, State):
@@ -117,6 +120,10 @@ class Trajectory:
         if abs(last - round(last)) > 1e-6:
             raise InputError(f"the last frame is after {last:g} steps, which no run goes on from")
         return round(last)
+
+    def __repr__(self) -> str:
+        frames = f"{len(self)} frame{'' if len(self) == 1 else 's'}"
+        return f"Trajectory({frames} of {self.cloth.nodes} nodes, {self.step:g} s apart, {self.cloth})"
 
     def __eq__(self, other: object) -> bool:
         """Tells whether two have the same frames of the same cloth, to the last bit."""

@@ -10,6 +10,8 @@ import numpy as np
 from ..errors import InputError, finite_array, real
 
 VIEW = (0.8, 1.0, 0.4)
+ALLOWED = "3 numbers, the way from the cloth to the camera, such as (0, 0, 1) from the top, (1, 0, 0) from a side"
+"""What a view may be."""
 MARGIN = 1.08
 """Size of the picture over that of what is in it."""
 
@@ -94,9 +96,12 @@ class Camera:
 
 def checked_view(name: str, view: Sequence[float]) -> np.ndarray:
     """Gives a direction to look from [3], or an InputError."""
-    toward = finite_array(name, view, (3,))
+    try:
+        toward = finite_array(name, view, (3,))
+    except InputError as error:
+        raise InputError(f"{error}: {ALLOWED}") from error
     if not toward.any():
-        raise InputError(f"{name} = {tuple(view)}, must not be 0")
+        raise InputError(f"{name} = {tuple(view)}, must not be 0: {ALLOWED}")
     return toward
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import weakref
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,13 @@ OBSTACLE_COLOR = (0.62, 0.60, 0.57)
 
 PLANE_MARGIN = 0.15
 """How far the rectangle that stands for a plane goes beyond what is above it, over the longer side of that."""
+
+SURROUNDINGS = 0.15
+"""How far about the cloth planes are in view, over its largest extent: what is beyond may be cut off."""
+
+WHOLE = 4.0
+"""Over that extent: the largest of cloth and an obstacle that are in view together, whole. Of a larger one, or one that
+leaves, what is near is in view, as of a plane: all of it would leave the cloth too small."""
 
 BACK = np.array([-1.0, -1.0, -1.0, 1.0])
 """Times a quaternion (x, y, z, w): what turns back."""
@@ -107,6 +115,16 @@ def placed(trajectory: Trajectory, at: np.ndarray | None = None) -> list[Placed]
             position = position + _turned(rotation, np.append(0.5 * (low + high), 0.0))
         result.append(Placed(obstacle, position, rotation, width, length))
     return result
+
+
+def in_view(obstacles: Iterable[Placed], low: np.ndarray, high: np.ndarray) -> Iterator[np.ndarray]:
+    """Gives points [n, 3] (m) of each obstacle that a picture shall have in it beside a cloth in a box [3], [3] (m)."""
+    size = float((high - low).max())
+    for each in obstacles:
+        corners = each.world(each.corners()).reshape(-1, 3)
+        both = np.maximum(corners.max(axis=0), high) - np.minimum(corners.min(axis=0), low)
+        whole = each.obstacle.shape != "plane" and both.max() <= WHOLE * size
+        yield corners if whole else np.clip(corners, low - SURROUNDINGS * size, high + SURROUNDINGS * size)
 
 
 def between(position: np.ndarray, at: float) -> np.ndarray:

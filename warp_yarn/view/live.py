@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import InputError, SimulationError, brief, integer, missing_extra
 from ..simulation.state import Trajectory
 from .camera import VIEW, Camera
-from .geometry import OBSTACLE_COLOR, placed
+from .geometry import OBSTACLE_COLOR, in_view, placed
 from .solids import solid
 from .yarns import Tubes, Weaving
 
@@ -218,7 +218,8 @@ class _Page:
         half = max(float(strands.half.max()) for strands in self._weaving.strands)
         points = np.concatenate([strands.points(*look) for strands in self._weaving.strands])
         # square, since the controls take a side of the window
-        camera = Camera.framing([points], half, 1.0, VIEW, lens=45.0)
+        beside = in_view(placed(_frame(simulator)), points.min(axis=0), points.max(axis=0))
+        camera = Camera.framing([points, *beside], half, 1.0, VIEW, lens=45.0)
         # a browser's camera sees nothing that is as near as a cloth of centimetres is
         self._scale = 1.0 / max(float(np.ptp(points, axis=0).max()), np.finfo(float).tiny)
         self._origin = np.array(camera.target)

@@ -17,7 +17,7 @@ from ..io.files import atomic_write
 from ..simulation.state import Trajectory
 from . import raster
 from .camera import VIEW, Camera
-from .geometry import OBSTACLE_COLOR, Placed, between, checked, placed
+from .geometry import OBSTACLE_COLOR, Placed, between, checked, in_view, placed
 from .solids import solid
 from .yarns import Tubes, Weaving
 
@@ -29,8 +29,6 @@ FACET = 0.25
 """How far a tube's facets may be from round, in pixels."""
 MOST_SIDES, MOST_RINGS = 24, 8
 BACKGROUND = (219, 222, 227)
-SURROUNDINGS = 0.15
-"""How far about the yarns obstacles are in view, over the largest extent of these: what is beyond may be cut off."""
 LAMPS = (((-0.6, 0.6, 0.9), 0.85), ((0.8, -0.3, 0.7), 0.35), ((0.0, -0.9, 0.4), 0.2), ((0.3, 0.9, -0.5), 0.4))
 """Where light comes from as the camera sees it (right, up, toward it), and how bright it is: key light, fill, one from
 below for the undersides, one from behind for the rims."""
@@ -58,7 +56,8 @@ def write_png(
         frame: which frame; negative ones count from the end.
         size: width and height in pixels, from 16 to 16384.
         view: direction from the cloth to the camera, 3 numbers, not 0; from straight above y is up in the picture.
-        camera: where to look from; None: from where the frame fills the picture. ``Camera.of`` gives one for
+        camera: where to look from; None: from where the frame fills the picture, with the obstacles that are not planes
+            and, together with the cloth, no more than 4 times as large as that. ``Camera.of`` gives one for
             several pictures.
         selvedge: weft yarns turn at the edge and go on as the next one of their material, and do not end there.
 
@@ -83,7 +82,7 @@ def write_mp4(
     trajectory: Trajectory,
     *,
     fps: float = 24.0,
-    slowdown: float = 10.0,
+    slowdown: float = 1.0,
     size: Sequence[int] = (960, 720),
     view: Sequence[float] = VIEW,
     camera: Camera | None = None,
@@ -94,14 +93,14 @@ def write_mp4(
     """Draws a trajectory as a movie (H.264), seen by a camera that stands still.
 
     Picture k shows time k / (fps · slowdown); between two frames of the trajectory every node is taken
-    to move along a straight line, and every obstacle to move and turn steadily. Needs the extra ``render``. The file
-    appears whole or not at all.
+    to move along a straight line, and every obstacle to move and turn steadily. The file's comment says the slowdown.
+    Needs the extra ``render``. The file appears whole or not at all.
 
     Args:
         path: of the movie, ending in .mp4.
         trajectory: what to draw, at least one frame.
         fps: pictures in one second of playing time, above 0.
-        slowdown: seconds of playing time for one second of simulated time, above 0.
+        slowdown: seconds of playing time for one second of simulated time, above 0, as of ``write_usd``.
         size: width and height in pixels, even, from 16 to 16384.
         view, camera, selvedge: as of ``write_png``; without a camera every frame is in view.
         progress: show a progress bar; None: where stderr is a terminal.
@@ -115,7 +114,8 @@ def write_mp4(
         warnings.warn("write_mp4's frames_per_second is fps now", DeprecationWarning, stacklevel=2)
         fps = frames_per_second
     rate = real("fps", fps, above=0.0)
-    apart = 1.0 / (rate * real("slowdown", slowdown, above=0.0))
+    slowdown = real("slowdown", slowdown, above=0.0)
+    apart = 1.0 / (rate * slowdown)
     size = checked_size("size", size, movie=True)
     imageio = _extra("imageio.v2")
     _extra("imageio_ffmpeg")
@@ -123,7 +123,9 @@ def write_mp4(
     scene = _Picture(trajectory, at, size, view, camera, selvedge, "movie")
     with atomic_write(path) as temporary:
         # Blocks of 2, since H.264 needs even sizes only and imageio would scale to multiples of 16.
-        writer = imageio.get_writer(temporary, fps=rate, codec="libx264", quality=8, macro_block_size=2)
+        said = ["-metadata", f"comment=One second of simulated time takes {slowdown:g} s to play."]
+        options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "output_params": said}
+        writer = imageio.get_writer(temporary, fps=rate, **options)
         disable = None if progress is None else not progress
         with writer:
             for frame in tqdm.trange(len(at), desc="drawing", unit="picture", disable=disable):
@@ -162,17 +164,15 @@ def framed(
     size: tuple[int, int],
     view: Sequence[float],
 ) -> Camera:
-    """Finds a camera that has the yarns at so many times in view, and of the obstacles what is near."""
+    """Finds a camera that has the yarns at so many times in view, and obstacles as ``in_view`` says."""
     half = max(float(strands.half.max()) for strands in weaving.strands)
     low, high = trajectory.position.min(axis=(0, 1)), trajectory.position.max(axis=(0, 1))
-    more = SURROUNDINGS * (high - low).max()
 
     def frames() -> Iterator[np.ndarray]:
         for when in at:
             look = weaving.look(between(trajectory.position, when))
             yield np.concatenate([strands.points(*look) for strands in weaving.strands])
-        for each in obstacles:
-            yield np.clip(each.world(each.corners()).reshape(-1, 3), low - more, high + more)
+        yield from in_view(obstacles, low, high)
 
     return Camera.framing(frames(), half, size[0] / size[1], view)
 
@@ -180,7 +180,7 @@ def framed(
 class _Picture:
     """What is in a picture at so many times, in frames of the trajectory, which need not be whole.
 
-    Without a camera it has the yarns of all of them in view, and of the obstacles what is near.
+    Without a camera it has the yarns of all of them in view, and obstacles as ``in_view`` says.
     """
 
     def __init__(

@@ -68,11 +68,11 @@ class Strands:
 
     def points(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Finds where the yarns pass [points, 3] (m), of places as ``Weaving.look`` gives them."""
-        return places[self.places] + self.height[:, None] * normals[self.places]
+        return places.take(self.places, axis=0) + self.height[:, None] * normals.take(self.places, axis=0)
 
     def slid(self, rest: np.ndarray, euler: np.ndarray) -> np.ndarray:
         """Computes ``arc`` where yarns have slid from (u, v) at rest to others, [nodes, 2] each (m)."""
-        moved = (euler - rest)[self.arc_of[:, 0], self.arc_of[:, 1]]
+        moved = (euler - rest).ravel().take(2 * self.arc_of[:, 0] + self.arc_of[:, 1])
         return self.arc + self.arc_sign * moved
 
 
@@ -103,6 +103,9 @@ class Weaving:
         self._tips: list[tuple[int, int, float]] = []
         self._turns: list[tuple[int, int]] = []
         self.strands = self._strands(selvedge)
+        self._ends, self._befores = (np.array([tip[k] for tip in self._tips], dtype=int) for k in (0, 1))
+        self._reach = np.array([tip[2] for tip in self._tips])[:, None]
+        self._edge = np.flatnonzero(self.crossed & (topology.is_crossing == 0))
         # of a node on one yarn only the normal is that of the next one
         self._alone = np.flatnonzero(~self.crossed)
         near = np.concatenate([self._after[:, self._alone], self._before[:, self._alone]])
@@ -111,16 +114,22 @@ class Weaving:
     def look(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Finds all places of one frame [places, 3] (m), of positions [nodes, 3], and the cloth's normals there
         [places, 3], along u × v."""
-        normal = contact_normals(self.cloth, position[None])[0] * self._side[:, None]
-        edge = np.flatnonzero(self.crossed & (self.cloth.topology.is_crossing == 0))
+        return self.looks(position[None])[0]
+
+    def looks(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Finds what ``look`` does, of several frames [frames, nodes, 3]."""
+        normals = contact_normals(self.cloth, positions) * self._side[:, None]
+        return [self._look(position, normal) for position, normal in zip(positions, normals, strict=True)]
+
+    def _look(self, position: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        edge = self._edge
         tangents = [position[self._after[d, edge]] - position[self._before[d, edge]] for d in (0, 1)]
         normal[edge] = unit(np.cross(*tangents))
         normal[self._alone] = normal[self._like]
         if not self._tips:
             return position, normal
-        ends, befores = (np.array([tip[k] for tip in self._tips]) for k in (0, 1))
-        reach = np.array([tip[2] for tip in self._tips])
-        tips = position[ends] + reach[:, None] * unit(position[ends] - position[befores])
+        ends = self._ends
+        tips = position[ends] + self._reach * unit(position[ends] - position[self._befores])
         places, normals = [position, tips], [normal, normal[ends]]
         if self._turns:
             a, b = (np.array([turn[k] for turn in self._turns]) for k in (0, 1))
