@@ -59,7 +59,7 @@ OF_CLOTH: dict[str, Any] = {
     "friction_damping": 0.1,
     "friction_sharpness": 9.0,
     "parallel_stiffness": 2.0,
-    "pose": CLOTH.position + [0.0, 0.0, 1e-3],
+    "pose": CLOTH.position + np.array([0.0, 0.0, 1e-3]),
     "outline": SQUARE[:3],
     "holes": {"outline": SQUARE, "holes": [[[2.2e-3, 2.2e-3], [3.7e-3, 2.2e-3], [3.7e-3, 3.7e-3]]]},
 }

@@ -11,7 +11,7 @@ import numpy as np
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..device.model import Model
-from ..errors import InputError, choice, integer
+from ..errors import InputError, choice, flag, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
@@ -253,14 +253,15 @@ def _made(
     method: Any = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
     if max_iterations is not None:
         integer("max_iterations", max_iterations, least=1, most=LARGEST)
+    energy_watch, differentiable = flag("energy_watch", energy_watch), flag("differentiable", differentiable)
     step_error = checked_step_error(step_error, integrator, differentiable)
     check_contact(scene, integrator)
     if hook is not None and not callable(hook):
         raise InputError(f"hook = {hook!r}, must be a function of the simulator, or None")
     hooked = hook is not None
     model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, hooked=hooked, **options)
-    model.energy.on = model.energy.on and bool(energy_watch)
-    model.contact.damps_impacts = bool(energy_watch)
+    model.energy.on = model.energy.on and energy_watch
+    model.contact.damps_impacts = energy_watch
     refuse_recording(model.device)
     at_once = method(model)
     if step_error is not None:
