@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from internals import made_of, options_of
 
 import warp_yarn as wy
 
-YARNS = [wy.Yarn(density=2e-5, stretch=1e9, bend=0.2, radius=8e-5), wy.fabrics.denim.yarns[0]]
+YARNS = [wy.Yarn(density=2e-5, stretch=1e9, bend=0.2, radius=1.2e-4), wy.fabrics.denim.yarns[0]]
 CLOTH = wy.Cloth(wy.Weave.plain(rows=6, columns=6), yarns=YARNS, crimp=0.07, pose="flat")
 SCENE = wy.Scene(CLOTH, wind=wy.Wind(velocity=(0.0, 1.0, 0.0)), pins=[0, 5], seams=[[6, 30]], parameters={})
 SQUARE = np.array([[0.0, 0.0], [5e-3, 0.0], [5e-3, 5e-3], [0.0, 5e-3]])
@@ -26,7 +27,7 @@ OF_YARN: dict[str, Any] = {
     "stretch": 2e9,
     "bend": 0.3,
     "color": (0.1, 0.2, 0.3),
-    "radius": 9e-5,
+    "radius": 1.1e-4,
     "width": {"radius": None, "width": 1e-4, "thickness": 1.6e-4},
     "thickness": {"radius": None, "width": 1.6e-4, "thickness": 1e-4},
 }
@@ -138,7 +139,7 @@ def held(base: Any, changed: Any, again: Callable[[Any], Any], tmp_path: Path) -
 @pytest.mark.parametrize("change", changes(OF_SCENE))
 def test_of_scenes(change: dict[str, Any], tmp_path: Path) -> None:
     changed = SCENE.replace(**change)
-    held(SCENE, changed, lambda scene: scene.replace(**{name: SCENE._arguments[name] for name in change}), tmp_path)
+    held(SCENE, changed, lambda scene: scene.replace(**{name: made_of(SCENE)[name] for name in change}), tmp_path)
 
 
 @pytest.mark.parametrize("change", changes(OF_CLOTH))
@@ -146,13 +147,11 @@ def test_of_cloths(change: dict[str, Any], tmp_path: Path) -> None:
     changed = CLOTH.replace(**change)
 
     def back(scene: wy.Scene) -> wy.Scene:
-        return wy.Scene(scene.cloth.replace(**{name: CLOTH._arguments[name] for name in change}))
+        return wy.Scene(scene.cloth.replace(**{name: made_of(CLOTH)[name] for name in change}))
 
     held(wy.Scene(CLOTH), wy.Scene(changed), back, tmp_path)
-    # and one of several
-    held(wy.Scene([CLOTH, CLOTH]), wy.Scene([CLOTH, changed]), lambda _: wy.Scene([CLOTH, CLOTH]), tmp_path) if not (
-        {"friction_sharpness", "parallel_stiffness"} & set(change)
-    ) else None
+    if not {"friction_sharpness", "parallel_stiffness"} & set(change):  # which several cloths share
+        held(wy.Scene([CLOTH, CLOTH]), wy.Scene([CLOTH, changed]), lambda _: wy.Scene([CLOTH, CLOTH]), tmp_path)
 
 
 @pytest.mark.parametrize("change", changes(OF_YARN))
@@ -187,7 +186,7 @@ def test_of_a_simulator() -> None:
     """Copies keep every option, and those that decide how steps come out are recorded."""
     names = set(inspect.signature(wy.Simulator).parameters) - {"scene"}
     sim = wy.Simulator(wy.Scene(CLOTH, terms=[]))
-    assert set(sim._options) == names
+    assert set(options_of(sim)) == names
     where = {"device", "threads", "chunk", "differentiable", "hook"}  # where and how fast, or no number
     assert set(sim.run(0).options or ()) == names - where
 

@@ -1,10 +1,13 @@
 """Motions of cloths whose yarns straighten at each other's expense."""
 
+import warnings
+
 import numpy as np
 import pytest
 from checks import matrix
 
 import warp_yarn as wy
+from warp_yarn.presets.named import NamedFabric
 
 
 def cotton(crimp: float | None = None, weave: str = "plain", size: int = 6) -> wy.Cloth:
@@ -63,6 +66,49 @@ def test_yarns_too_thick_for_their_crimp_draw_the_cloth_in() -> None:
         assert (found < c.spacing) == (crimp < 0.07)
         # crimp's own bending keeps some of it as woven, where the yarn is a thousand times softer across
         assert abs(found / expected - 1.0) < 0.005
+
+
+CRIMPED = [
+    name for name, made in vars(wy.fabrics).items() if isinstance(made, NamedFabric) and made.crimp != (0.0, 0.0)
+]
+
+
+@pytest.mark.parametrize("name", CRIMPED)
+def test_named_fabrics_that_are_pressed_stay_as_they_are_woven(name: str) -> None:
+    """Their yarns are mostly thicker than they rise: as they are such a cloth draws in at once."""
+    loose = getattr(wy.fabrics, name)(rows=6, columns=6, pose="flat")
+    c = loose.pressed()
+    assert c.mass == loose.mass
+    np.testing.assert_allclose(c.stretch_stiffness, loose.stretch_stiffness, rtol=1e-14)
+    np.testing.assert_allclose(c.halves[:, 0], loose.halves[:, 0], rtol=1e-14)
+    rise = c.halves[:, 1] / loose.halves[:, 1]
+    np.testing.assert_allclose(rise, rise[0], rtol=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = wy.Scene(c, gravity=None, sliding=False, crimp_interchange=True)
+    sim = wy.Simulator(scene, integrator="implicit-euler")
+    # of the pull that a hundredth of strain takes
+    size = 1e-2 * c.stretch_stiffness.max()
+    assert np.abs(sim.forces()["crimp_interchange"][0]).max() < 1e-10 * size
+    sim.run(3)
+    assert np.abs(sim.state.position - c.position).max() < 1e-9 * c.shortest_spacing
+    if 0.8 <= rise[0] <= 1.25:
+        return
+    with pytest.warns(
+        wy.WarpYarnWarning, match=r"yarns of the cloth rise .* times their thicknesses.*cloth.pressed\(\)"
+    ):
+        pulled = wy.Simulator(scene.replace(cloth=loose)).forces()["crimp_interchange"][0]
+    assert np.abs(pulled).max() > 1e-5 * size
+    with pytest.warns(wy.WarpYarnWarning, match=r"yarns of cloths\[1\] rise"):
+        wy.Scene([c, loose], crimp_interchange=True)
+
+
+def test_pressed_needs_crimp() -> None:
+    plain = wy.fabrics.cotton(rows=5, columns=5)
+    with pytest.raises(wy.InputError, match="pressed: the cloth has no crimp, must be above 0"):
+        plain.pressed()
+    with pytest.raises(wy.InputError, match=r"crimp_interchange = True, but cloths\[1\] has no crimp"):
+        wy.Scene([cotton(), plain], crimp_interchange=True)
 
 
 @pytest.mark.slow

@@ -59,8 +59,17 @@ def pressed(cloth: Cloth) -> Cloth:
     factor, yarns = room(cloth), []
     for yarn in cloth.yarns:
         half_width, half_thickness = yarn.halves(cloth.radius)
-        size = {"radius": None, "width": 2.0 * half_width, "thickness": 2.0 * factor * half_thickness}
-        yarns.append(dataclasses.replace(yarn, stretch=yarn.stretch / factor, bend=yarn.bend / factor, **size))
+        yarns.append(
+            dataclasses.replace(
+                yarn,
+                # kₛ and k_b of a section by this factor
+                stretch=yarn.stretch / factor,
+                bend=yarn.bend / factor,
+                radius=None,
+                width=2.0 * half_width,
+                thickness=2.0 * factor * half_thickness,
+            )
+        )
     return cloth.replace(yarns=yarns)
 
 

@@ -15,6 +15,8 @@ from . import declarations
 if TYPE_CHECKING:
     from .model import Model
 
+MEMORY = ("bounds", "steps_to_audit", "audit_due", "alert", "outer_force")
+"""What it writes down of steps, for those that come; outer_force where outer forces do work."""
 AT_END, AT_START = 2, 3
 """The places of a step's end and start among ``stage_times``, behind those of two stages."""
 
@@ -43,6 +45,17 @@ class EnergyWatch:
         for name, value in (("audit_due", 1), ("alert", 0)):
             self.model.arrays.put(name, value)
         self.model.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0, 0.0)
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """Copies what it has written down."""
+        a = self.model.arrays
+        return {name: a[name].numpy().copy() for name in MEMORY if name in a}
+
+    def recall(self, memory: dict[str, np.ndarray]) -> None:
+        """Goes on from what ``memory`` gave, of the same scene."""
+        for name, value in memory.items():
+            array = self.model.arrays[name]
+            array.assign(value.astype(array.numpy().dtype).reshape(array.numpy().shape))
 
     def trust(self) -> None:
         """Lets all steps pass, until ``forget``: steps that are made again, from the middle of a run, were

@@ -48,7 +48,7 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
 
 
 def known_conditions(scene: Scene, variant: Variant, terms: list[Term]) -> dict[str, bool]:
-    """Tell of every condition whether it holds for a scene."""
+    """Look whether each condition that there is holds for a scene."""
     names = {term.name for term in terms}
     # which may read any index array
     others = any(not own(term) for term in terms)

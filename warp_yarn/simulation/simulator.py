@@ -143,7 +143,7 @@ class Simulator(Loads, Filming):
             names = [name for name in (*BESIDE_TERMS, *parameters()) if name in self.arrays]
             values = {name: self.arrays[name].numpy().copy() for name in names}
             steps = (self.steps_done, dict(self.split_steps), set(self.damped_steps))
-            rest = (self.state, *steps, self.substepping.next_size, values)
+            rest = (self.state, *steps, self.substepping.next_size, values, self.model.energy.memory())
         return _rebuilt, (type(self), self.scene, self._options, *rest)
 
     @alone
@@ -286,6 +286,7 @@ def _rebuilt(
     damped_steps: set[int],
     size: float,
     values: dict[str, np.ndarray],
+    watched: dict[str, np.ndarray],
 ) -> Simulator:
     """Makes a simulator as another was when it was copied or pickled."""
     result = kind(scene, **options)
@@ -293,6 +294,7 @@ def _rebuilt(
         for name, value in values.items():
             result.arrays[name].assign(value)
         result.stepper.frames.upload(state)
+        result.model.energy.recall(watched)
     stepper = result.stepper
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size
