@@ -587,7 +587,10 @@ def test_a_process_that_is_ended_leaves_whole_files(tmp_path, number):
     npz, h5 = (wy.Trajectory.load(path) for path in paths[:2])
     assert npz == h5 and npz.end.state == h5.end.state
     sim = wy.Simulator(npz.scene)
-    assert sim.run(npz.steps_done, fps=100) == npz and sim.state == npz.end.state
+    run = sim.run(npz.steps_done, fps=100)
+    # the frame at the end may be lacking: the signal may come between a step and its frame
+    assert len(run) - len(npz) in (0, 1) and run[: len(npz)] == npz
+    assert sim.state == npz.end.state
 
 
 @pytest.mark.slow

@@ -16,7 +16,15 @@ from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
 from .alone import alone
-from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
+from .checks import (
+    LARGEST,
+    check_contact,
+    check_sliding_crimp,
+    checked_chunk,
+    checked_state,
+    checked_step_error,
+    warn_of_threads,
+)
 from .diagnosis import Failure
 from .film import DECIDING, Filming, bar
 from .frames import Frames
@@ -256,6 +264,7 @@ def _made(
     energy_watch, differentiable = flag("energy_watch", energy_watch), flag("differentiable", differentiable)
     step_error = checked_step_error(step_error, integrator, differentiable)
     check_contact(scene, integrator)
+    check_sliding_crimp(scene, integrator)
     if hook is not None and not callable(hook):
         raise InputError(f"hook = {hook!r}, must be a function of the simulator, or None")
     hooked = hook is not None
