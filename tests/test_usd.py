@@ -590,32 +590,32 @@ def test_tubes_do_not_run_through_each_other(weave, radius, off):
 
 SHAPES = {
     "rectangle": lambda c: wy.outline.rectangle(*c.size, center=c.middle),
-    "bias": lambda c: wy.outline.rectangle(9e-3, 5e-3, angle=45.0, center=c.middle),
-    "disc": lambda c: wy.outline.disc(4.3e-3, center=c.middle),
+    "bias": lambda c: wy.outline.rectangle(7e-3, 3.5e-3, angle=45.0, center=c.middle),
+    "disc": lambda c: wy.outline.disc(3.3e-3, center=c.middle),
 }
 
 
-@pytest.mark.parametrize("radius", [3.3e-4, 4.5e-4, 5e-4])
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("weaves", ["plain", "2/2 twill"])
+@pytest.mark.parametrize("weaves, radius", [("plain", 3.3e-4), ("plain", 5e-4), ("2/2 twill", 4.5e-4)])
 def test_free_ends_are_whole_and_in_no_other_yarn(weaves, shape, radius):
     """Of what is cut out of a flat cloth: the sections of free ends are those of the yarn, and a quarter less of them
     is outside of all yarns of the other direction."""
-    size = 7 if shape == "rectangle" else 13
+    size = 6 if shape == "rectangle" else 11
     weave = wy.Weave.from_notation(weaves, rows=size, columns=size)
     yarns_of_both = [wy.Yarn(density=5e-5, stretch=1e7, bend=0.05)] * 2
     whole = wy.Cloth(weave, yarns=yarns_of_both, warp=[0] * size, weft=[1] * size, radius=radius, pose="flat")
     cloth = whole.cut(SHAPES[shape](whole))
     weaving = yarns.Weaving(cloth)
     look = weaving.look(cloth.position)
-    tubes = [yarns.Tubes.around(strands, samples=6) for strands in weaving.strands]
+    tubes = [yarns.Tubes.around(strands, samples=4) for strands in weaving.strands]
     for one, others in (tubes, tubes[::-1]):
         crossed = one.strands.across[:, 0] > 0.0
         ends = crossed[one.points].sum(axis=1) == 1
         np.testing.assert_allclose(one.half[ends], radius, rtol=1e-12)
         centre, _ = one.rings(*look)
         smaller = centre[:, None] + 0.75 * (one.vertices(*look, 8).reshape(-1, 8, 3) - centre[:, None])
-        around = winding(smaller[ends].reshape(-1, 3), others.vertices(*look, 12), triangles(others, 12))
+        around = winding(smaller[ends].reshape(-1, 3), others.vertices(*look, 8), triangles(others, 8))
         assert np.abs(around).max() < 0.5
 
 

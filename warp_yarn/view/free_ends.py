@@ -12,6 +12,8 @@ from ..description.cloths import Cloths
 
 STEEPEST = 0.5
 """Slope of free ends."""
+LEAN = STEEPEST / math.hypot(1.0, STEEPEST)
+"""How far the caps of these reach beyond their middle, in half heights."""
 
 
 def clear(reach: float, height: float, half: float, crossed: np.ndarray) -> float:
@@ -77,7 +79,8 @@ def trims(cloth: Cloth | Cloths) -> np.ndarray:
         found.setdefault(tuple(place.tolist()), ([], []))[along].append((node, left))
     for warp, weft in found.values():
         for (a, left_a), (b, left_b) in itertools.product(warp, weft):
-            into = cloth.halves[yarns[b, 1], 0] - left_a, cloth.halves[yarns[a, 0], 0] - left_b
+            mine, its = cloth.halves[yarns[a, 0]], cloth.halves[yarns[b, 1]]
+            into = its[0] + LEAN * mine[1] - left_a, mine[0] + LEAN * its[1] - left_b
             if min(into) > 0.0:
                 # one of them is enough
                 node = a if into[0] < into[1] else b
