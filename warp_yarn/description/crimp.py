@@ -39,9 +39,12 @@ def crimp_height(distance: Any, length: Any) -> Any:
 
 
 def heights(cloth: Woven) -> np.ndarray:
-    """Computes how high every yarn rises as woven, over the mean of the distances that it covers [yarns] (m)."""
-    yarn = cloth.topology.segment_yarn
-    distance = np.bincount(yarn, cloth.segment_spacing) / np.bincount(yarn)
+    """Computes how high every yarn rises as woven, over the mean of the distances between those that it crosses, of one
+    that crosses a single one those of its ends [yarns] (m)."""
+    topology, yarn = cloth.topology, cloth.topology.segment_yarn
+    between = (topology.is_end[topology.segment_nodes] == 0).all(axis=1)
+    counted = between | (np.bincount(yarn, between)[yarn] == 0)
+    distance = np.bincount(yarn, cloth.segment_spacing * counted) / np.bincount(yarn, counted)
     return crimp_height(distance, distance * (1.0 + cloth.yarn_crimp))
 
 
