@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..description.sanity import warn_of_rounding
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..device.model import Model
@@ -142,6 +143,8 @@ class Simulator(Loads, Filming):
             self.stepper.frames.options = {name: self._options[name] for name in DECIDING}
         self.check_clear()
         warn_of_threads(threads)
+        if precision == "single":
+            warn_of_rounding(scene.cloth)
 
     parts = renamed_attribute("parts", "substepping")
 
