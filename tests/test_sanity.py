@@ -208,8 +208,6 @@ def test_single_precision_warns_of_stiff_light_yarns() -> None:
             warnings.simplefilter("always")
             single = wy.Simulator(scene, precision="single").run(30).position[-1]
         texts = [str(each.message) for each in found if each.category is wy.WarpYarnWarning]
-        assert [text.startswith("precision = 'single' rounds the pull of a yarn by ") for text in texts] == [
-            True
-        ] * warned
+        assert len(texts) == warned and all("precision = 'single' rounds the pull of a yarn" in text for text in texts)
         moved = np.abs(double - c.position).max()
         assert (np.abs(single - double).max() > 0.02 * moved) == warned

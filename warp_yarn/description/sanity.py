@@ -81,8 +81,8 @@ def warn_of_rounding(cloth: Woven) -> None:
     weight = 9.8 * cloth.mass / topology.nodes
     if pull > ROUNDED * weight:
         warnings.warn(
-            f"precision = 'single' rounds the pull of a yarn by {pull:.2g} N, {pull / weight:.2g} times the weight of a "
-            f"node, usual is at most {ROUNDED:g} times: these yarns are stiff and light, take 'double'",
+            f"precision = 'single' rounds the pull of a yarn by {pull:.2g} N, {pull / weight:.2g} times the weight of "
+            f"a node, usual is at most {ROUNDED:g} times: these yarns are stiff and light, take 'double'",
             WarpYarnWarning,
             stacklevel=3,
         )
