@@ -81,6 +81,17 @@ def test_eq_2_gains_no_energy_where_yarns_slide(name: str) -> None:
     assert sum(sim.energy().values()) < energy
 
 
+def test_eq_2_is_the_same_after_relaxing() -> None:
+    """Which iterates, and leaves at what evaluation it was."""
+    c = cotton()
+    scene = wy.Scene(c, pins=c.corners("top"), crimp_interchange=True)
+    sim, fresh = (wy.Simulator(scene, integrator="linear") for _ in range(2))
+    for residual in (1e-5, 3e-6, 1e-6):
+        sim.relax(residual=residual)
+        fresh.state = sim.state
+        assert sim.run(2) == fresh.run(2)
+
+
 def test_ros2_is_refused_where_yarns_slide() -> None:
     scene = wy.Scene(cotton(), crimp_interchange=True)
     with pytest.raises(wy.InputError, match=r"integrator = 'ros2' with crimp_interchange and sliding.*sliding=False"):
