@@ -134,6 +134,19 @@ def test_named_fabrics_that_are_pressed_stay_as_they_are_woven(name: str) -> Non
         wy.Scene([c, loose], crimp_interchange=True)
 
 
+@pytest.mark.parametrize("name", ["denim", "silk_satin"])
+def test_what_is_cut_is_pressed_alike(name: str) -> None:
+    """Free ends, of whatever length, are no part of what their yarns rise over."""
+    fabric = getattr(wy.fabrics, name)
+    outline = wy.outline.disc(5.0 * max(fabric.spacing))
+    c = wy.piece(fabric, outline, pose="flat").pressed()
+    before = wy.piece(lambda **options: fabric(**options).pressed(), outline, pose="flat")
+    np.testing.assert_allclose(c.halves, before.halves, rtol=1e-12)
+    sim = wy.Simulator(wy.Scene(c, gravity=None, sliding=False, crimp_interchange=True))
+    size = 1e-2 * c.stretch_stiffness.max()
+    assert np.abs(sim.forces()["crimp_interchange"][0]).max() < 1e-10 * size
+
+
 def test_pressed_needs_crimp() -> None:
     plain = wy.fabrics.cotton(rows=5, columns=5)
     with pytest.raises(wy.InputError, match="pressed: the cloth has no crimp, must be above 0"):
