@@ -588,7 +588,7 @@ def test_tubes_do_not_run_through_each_other(weave, radius, off):
         assert np.abs(around).max() < 0.5
 
 
-SHAPES = {
+OUTLINES = {
     "rectangle": lambda c: wy.outline.rectangle(*c.size, center=c.middle),
     "bias": lambda c: wy.outline.rectangle(7e-3, 3.5e-3, angle=45.0, center=c.middle),
     "disc": lambda c: wy.outline.disc(3.3e-3, center=c.middle),
@@ -596,7 +596,7 @@ SHAPES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", OUTLINES)
 @pytest.mark.parametrize("weaves, radius", [("plain", 3.3e-4), ("plain", 5e-4), ("2/2 twill", 4.5e-4)])
 def test_free_ends_are_whole_and_in_no_other_yarn(weaves, shape, radius):
     """Of what is cut out of a flat cloth: the sections of free ends are those of the yarn, and a quarter less of them
@@ -605,7 +605,7 @@ def test_free_ends_are_whole_and_in_no_other_yarn(weaves, shape, radius):
     weave = wy.Weave.from_notation(weaves, rows=size, columns=size)
     yarns_of_both = [wy.Yarn(density=5e-5, stretch=1e7, bend=0.05)] * 2
     whole = wy.Cloth(weave, yarns=yarns_of_both, warp=[0] * size, weft=[1] * size, radius=radius, pose="flat")
-    cloth = whole.cut(SHAPES[shape](whole))
+    cloth = whole.cut(OUTLINES[shape](whole))
     weaving = yarns.Weaving(cloth)
     look = weaving.look(cloth.position)
     tubes = [yarns.Tubes.around(strands, samples=4) for strands in weaving.strands]

@@ -165,7 +165,7 @@ class Filming:
         if end is not None:
             simulator.substepping.next_size = end.next_size
             with ALONE:
-                simulator.stepper.model.energy.recall(end.watched)
+                simulator.stepper.model.energy.go_on(end.watched, end.steps_done)
         return simulator
 
     @property

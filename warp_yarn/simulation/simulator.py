@@ -306,7 +306,7 @@ def _rebuilt(
         for name, value in values.items():
             result.arrays[name].assign(value)
         result.stepper.frames.upload(state)
-        result.model.energy.recall(watched)
+        result.model.energy.go_on(watched, steps_done)
     stepper = result.stepper
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size
