@@ -310,6 +310,19 @@ def locks_taken() -> list[object]:
     return taken
 
 
+# -- what things are made of ------------------------------------------------------------------------------------------
+
+
+def made_of(thing: wy.Scene | wy.Cloth) -> dict[str, object]:
+    """The arguments of a scene or a cloth."""
+    return thing._arguments
+
+
+def options_of(simulator: wy.Simulator) -> dict[str, object]:
+    """All that a simulator was made with beside its scene."""
+    return simulator._options
+
+
 # -- parts of public functions that are worth a test of their own -----------------------------------------------------
 
 halved: Callable = ablation._halved

@@ -1,10 +1,13 @@
 """Motions of cloths whose yarns straighten at each other's expense."""
 
+import warnings
+
 import numpy as np
 import pytest
 from checks import matrix
 
 import warp_yarn as wy
+from warp_yarn.presets.named import NamedFabric
 
 
 def cotton(crimp: float | None = None, weave: str = "plain", size: int = 6) -> wy.Cloth:
@@ -63,6 +66,93 @@ def test_yarns_too_thick_for_their_crimp_draw_the_cloth_in() -> None:
         assert (found < c.spacing) == (crimp < 0.07)
         # crimp's own bending keeps some of it as woven, where the yarn is a thousand times softer across
         assert abs(found / expected - 1.0) < 0.005
+
+
+@pytest.mark.parametrize("name", ["kevlar_s706", "denim"])
+def test_eq_2_gains_no_energy_where_yarns_slide(name: str) -> None:
+    """Of one matrix a step, which is not exact then: less than the exact one would gain some, thrown and spun."""
+    c = getattr(wy.fabrics, name)(rows=6, columns=6, pose="flat").pressed()
+    sim = wy.Simulator(wy.Scene(c, gravity=None, crimp_interchange=True), integrator="linear")
+    state = sim.state
+    state.velocity[:] = np.cross([20.0, 5.0, 8.0], state.position - state.position.mean(axis=0))
+    sim.state = state
+    energy = sum(sim.energy().values())
+    sim.run(20)
+    assert sum(sim.energy().values()) < energy
+
+
+def test_eq_2_is_the_same_after_relaxing() -> None:
+    """Which iterates, and leaves at what evaluation it was."""
+    c = cotton()
+    scene = wy.Scene(c, pins=c.corners("top"), crimp_interchange=True)
+    sim, fresh = (wy.Simulator(scene, integrator="linear") for _ in range(2))
+    for residual in (1e-5, 3e-6, 1e-6):
+        sim.relax(residual=residual)
+        fresh.state = sim.state
+        assert sim.run(2) == fresh.run(2)
+
+
+def test_ros2_is_refused_where_yarns_slide() -> None:
+    scene = wy.Scene(cotton(), crimp_interchange=True)
+    with pytest.raises(wy.InputError, match=r"integrator = 'ros2' with crimp_interchange and sliding.*sliding=False"):
+        wy.Simulator(scene, integrator="ros2")
+    wy.Simulator(scene.replace(sliding=False), integrator="ros2").run(2)
+
+
+CRIMPED = [
+    name for name, made in vars(wy.fabrics).items() if isinstance(made, NamedFabric) and made.crimp != (0.0, 0.0)
+]
+
+
+@pytest.mark.parametrize("name", CRIMPED)
+def test_named_fabrics_that_are_pressed_stay_as_they_are_woven(name: str) -> None:
+    """Their yarns are mostly thicker than they rise: as they are such a cloth draws in at once."""
+    loose = getattr(wy.fabrics, name)(rows=6, columns=6, pose="flat")
+    c = loose.pressed()
+    assert c.mass == loose.mass
+    np.testing.assert_allclose(c.stretch_stiffness, loose.stretch_stiffness, rtol=1e-14)
+    np.testing.assert_allclose(c.halves[:, 0], loose.halves[:, 0], rtol=1e-14)
+    rise = c.halves[:, 1] / loose.halves[:, 1]
+    np.testing.assert_allclose(rise, rise[0], rtol=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = wy.Scene(c, gravity=None, sliding=False, crimp_interchange=True)
+    sim = wy.Simulator(scene, integrator="implicit-euler")
+    # of the pull that a hundredth of strain takes
+    size = 1e-2 * c.stretch_stiffness.max()
+    assert np.abs(sim.forces()["crimp_interchange"][0]).max() < 1e-10 * size
+    sim.run(3)
+    assert np.abs(sim.state.position - c.position).max() < 1e-9 * c.shortest_spacing
+    if 0.8 <= rise[0] <= 1.25:
+        return
+    with pytest.warns(
+        wy.WarpYarnWarning, match=r"yarns of the cloth rise .* times their thicknesses.*cloth.pressed\(\)"
+    ):
+        pulled = wy.Simulator(scene.replace(cloth=loose)).forces()["crimp_interchange"][0]
+    assert np.abs(pulled).max() > 1e-5 * size
+    with pytest.warns(wy.WarpYarnWarning, match=r"yarns of cloths\[1\] rise"):
+        wy.Scene([c, loose], crimp_interchange=True)
+
+
+@pytest.mark.parametrize("name", ["denim", "silk_satin"])
+def test_what_is_cut_is_pressed_alike(name: str) -> None:
+    """Free ends, of whatever length, are no part of what their yarns rise over."""
+    fabric = getattr(wy.fabrics, name)
+    outline = wy.outline.disc(5.0 * max(fabric.spacing))
+    c = wy.piece(fabric, outline, pose="flat").pressed()
+    before = wy.piece(lambda **options: fabric(**options).pressed(), outline, pose="flat")
+    np.testing.assert_allclose(c.halves, before.halves, rtol=1e-12)
+    sim = wy.Simulator(wy.Scene(c, gravity=None, sliding=False, crimp_interchange=True))
+    size = 1e-2 * c.stretch_stiffness.max()
+    assert np.abs(sim.forces()["crimp_interchange"][0]).max() < 1e-10 * size
+
+
+def test_pressed_needs_crimp() -> None:
+    plain = wy.fabrics.cotton(rows=5, columns=5)
+    with pytest.raises(wy.InputError, match="pressed: the cloth has no crimp, must be above 0"):
+        plain.pressed()
+    with pytest.raises(wy.InputError, match=r"crimp_interchange = True, but cloths\[1\] has no crimp"):
+        wy.Scene([cotton(), plain], crimp_interchange=True)
 
 
 @pytest.mark.slow

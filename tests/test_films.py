@@ -4,6 +4,7 @@ them."""
 import dataclasses
 import errno
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -90,7 +91,7 @@ def test_frames_are_at_their_times(asked, steps, places, chunk):
     # and those between two steps only: the others to the last bit
     for k in np.flatnonzero(places == np.round(places)):
         assert film[k] == whole[int(places[k])]
-    assert (film.end is None) == (places[-1] == steps) and (film.end is None or film.end.state == whole[-1])
+    assert film.end.state == whole[-1] and film.end.steps_done == steps
     sim.reset()
     given = list(sim.frames(**asked))
     assert len(given) == len(film) and all(a == b for a, b in zip(given, film, strict=True))
@@ -249,6 +250,33 @@ def test_single_precision_is_near_and_goes_on_exactly(tmp_path, ending):
     assert wy.Simulator.resumed(paths[1]).run(3) == wy.Simulator.resumed(paths[0]).run(3)
     double.save(paths[1], precision="single", compression=9)
     assert wy.Trajectory.load(paths[1]).end.state == double[-1]
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5", None, "pickle"])
+def test_what_gains_energy_goes_on_alike(tmp_path, ending):
+    """A strip on the bias, of which eq. 2 gains energy in some steps: the watch makes them in parts, by what it has
+    seen of those before."""
+    cloth = wy.piece(wy.fabrics.cotton, wy.outline.rectangle(3.5e-3, 1.8e-3, angle=45.0), pose="flat")
+    pins = np.flatnonzero(cloth.position[:, 1] < 0.12 * np.ptp(cloth.position[:, 1])).tolist()[::2]
+    scene = wy.Scene(cloth, pins=pins, sliding=False)
+    sim = wy.Simulator(scene, integrator="linear")
+    if ending == "pickle":
+        sim.run(6)
+        again = pickle.loads(pickle.dumps(sim))
+    elif ending is None:
+        again = wy.Simulator.resumed(sim.run(6))
+    else:
+        sim.record(tmp_path / f"a{ending}", steps=6)
+        again = wy.Simulator.resumed(tmp_path / f"a{ending}")
+    assert again.run(8) == sim.run(8)
+    steps = {step: size for step, size in sim.split_steps.items() if step > 6}
+    assert steps and {step: size for step, size in again.split_steps.items() if step > 6} == steps
+    # what it goes by is the watch's memory
+    forgetful = wy.Simulator(scene, integrator="linear")
+    forgetful.run(6)
+    forgetful.state = forgetful.state
+    forgetful.run(8)
+    assert {step for step in forgetful.split_steps if step > 6} != set(steps)
 
 
 def test_hdf5_is_readable_by_others(tmp_path):
@@ -559,7 +587,10 @@ def test_a_process_that_is_ended_leaves_whole_files(tmp_path, number):
     npz, h5 = (wy.Trajectory.load(path) for path in paths[:2])
     assert npz == h5 and npz.end.state == h5.end.state
     sim = wy.Simulator(npz.scene)
-    assert sim.run(npz.steps_done, fps=100) == npz and sim.state == npz.end.state
+    run = sim.run(npz.steps_done, fps=100)
+    # the frame at the end may be lacking: the signal may come between a step and its frame
+    assert len(run) - len(npz) in (0, 1) and run[: len(npz)] == npz
+    assert sim.state == npz.end.state
 
 
 @pytest.mark.slow

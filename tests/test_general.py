@@ -370,8 +370,10 @@ def test_yarns_are_drawn_at_their_sizes() -> None:
     for part in weaving.strands:
         np.testing.assert_array_equal(part.half, c.halves[part.yarn])
         height = np.abs(part.points(*weaving.look(c.position))[:, 2])
-        # 0 of free ends alone
-        assert height.max() == pytest.approx(part.half[0, 1]) and (height > 0.0).sum() == (part.places < c.nodes).sum()
+        # less of free ends alone
+        assert height.max() == pytest.approx(part.half[0, 1])
+        np.testing.assert_allclose(height[part.places < c.nodes], part.half[0, 1], rtol=1e-12)
+        assert height[part.places >= c.nodes].max() < 0.9 * part.half[0, 1]
 
 
 def test_crimped_yarns_are_drawn_as_far_apart_as_they_are() -> None:

@@ -439,7 +439,11 @@ def test_seams_hold() -> None:
         ([[1, 1]], "two different nodes"),
         ([[0, 10**6]], r"seams\[0\]"),
         ([[0, 1], [1, 0]], "twice"),
-        ([[0, 5], [0, 6], [0, 7]], "at most two of a node"),
+        ([[0, 5], [0, 6], [0, 7]], "seams has node 0 3 times, must have at most two of a node"),
+        ([[12, 20], [12, 21], [1, 12], [2, 12]], "seams has node 12 4 times"),
+        ([[0, 5], [6]], "seams must be an array of numbers"),
+        ({(0, 5)}, "pairs of nodes"),
+        (None, "pairs of nodes"),
         ([0, 1], "seams"),
         ("all", "pairs of nodes"),
     ],
@@ -447,6 +451,36 @@ def test_seams_hold() -> None:
 def test_bad_seams(seams: object, message: str) -> None:
     with pytest.raises(wy.InputError, match=message):
         wy.Simulator(wy.Scene(square(5, 5), seams=seams))
+
+
+CHAINS = {
+    "chain": [[1, 24], [1, 22], [0, 23], [0, 22]],
+    "ring": [[0, 22], [1, 22], [1, 23], [2, 23], [2, 24], [0, 24]],
+    "tangle": [[3, 20], [3, 7], [7, 15], [15, 20], [12, 24], [1, 12]],
+}
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_seams_in_any_order(name: str) -> None:
+    """Of whatever order and way round they are given, the matrix is the sum of what each has alone."""
+    c, seams = square(5, 5), CHAINS[name]
+    state = state_of(c)
+
+    def stiffness(seams: object) -> np.ndarray:
+        simulator = wy.Simulator(wy.Scene(c, terms=["seams"], seams=seams), integrator="linear")
+        return simulator.system(state, weights=(0.0, 0.0, 1.0)).dense()
+
+    expected = sum(stiffness([seam]) for seam in seams)
+    rng = np.random.default_rng(3)
+    for order in [range(len(seams)), *(rng.permutation(len(seams)) for _ in range(8))]:
+        given = [seams[k] if rng.integers(2) else seams[k][::-1] for k in order]
+        assert np.abs(stiffness(given) - expected).max() <= 1e-13 * np.abs(expected).max()
+
+
+def test_a_piece_is_as_large_as_its_outline() -> None:
+    for name in ("rows", "columns", "size"):
+        with pytest.raises(wy.InputError, match=f"{name} = 5: a piece is as large as its outline needs"):
+            wy.piece(wy.fabrics.handkerchief, wy.outline.disc(5e-3), **{name: 5})
 
 
 def test_seams_do_not_go_with_self_contact() -> None:

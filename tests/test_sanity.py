@@ -249,3 +249,18 @@ def test_sizes_in_millimetres_are_refused_before_they_fill_the_memory(make):
 def test_a_piece_is_of_a_fabric_and_not_of_a_cloth():
     with pytest.raises(wy.InputError, match="must be a function that makes a Cloth"):
         wy.piece(wy.fabrics.denim(), wy.outline.disc(0.01))
+
+
+def test_single_precision_warns_of_stiff_light_yarns() -> None:
+    """Where it is far off: a piece that hangs by a corner, after 30 ms."""
+    for fabric, warned in (("handkerchief", False), ("denim", True)):
+        c = getattr(wy.fabrics, fabric)(rows=6, columns=6, pose="flat")
+        scene = wy.Scene(c, pins=[0], sliding=False)
+        double = wy.Simulator(scene).run(30).position[-1]
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            single = wy.Simulator(scene, precision="single").run(30).position[-1]
+        texts = [str(each.message) for each in found if each.category is wy.WarpYarnWarning]
+        assert len(texts) == warned and all("precision = 'single' rounds the pull of a yarn" in text for text in texts)
+        moved = np.abs(double - c.position).max()
+        assert (np.abs(single - double).max() > 0.02 * moved) == warned

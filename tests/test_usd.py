@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import os
 
 import numpy as np
@@ -106,7 +107,8 @@ def test_yarns_of_a_moving_cloth_cross_at_a_diameter_along_its_normal(tmp_path, 
 
 
 def test_free_ends_stick_out_of_the_yarns_that_they_cross_last(tmp_path):
-    """By four tenths of a spacing, in the cloth's middle, straight on."""
+    """By four tenths of a spacing, straight on, from where they lie on it until they slope by a half; not below the
+    cloth's middle."""
     trajectory = two_colored("plain")
     _stage, shapes = written(tmp_path / "a.usda", trajectory)
     x = trajectory.position.reshape(-1, 6, 5, 3)
@@ -114,7 +116,12 @@ def test_free_ends_stick_out_of_the_yarns_that_they_cross_last(tmp_path):
         for curve, nodes in zip(with_ends(shapes["yarn_0"], frame), x[frame], strict=True):
             for end, before, tip in ((nodes[0], nodes[1], curve[0]), (nodes[-1], nodes[-2], curve[-1])):
                 way = (end - before) / np.linalg.norm(end - before)
-                np.testing.assert_allclose(tip, end + (RADIUS + 4e-4) * way, rtol=0, atol=SINGLE)
+                off = tip - end - (RADIUS + 4e-4) * way
+                assert abs(off @ way) < SINGLE
+                leaves = math.atan(2.0)
+                down = 0.5 * (RADIUS + 4e-4 - 2.0 * RADIUS * math.cos(leaves))
+                height = max(RADIUS * (2.0 * math.sin(leaves) - 1.0) - down, 0.0)
+                assert np.linalg.norm(off) == pytest.approx(height, abs=SINGLE)
 
 
 def test_selvedges_turn_from_each_weft_yarn_to_the_next(tmp_path):
@@ -578,6 +585,37 @@ def test_tubes_do_not_run_through_each_other(weave, radius, off):
         vertices = one.vertices(*look, 12).reshape(-1, 12, 3)[second]
         smaller = centre[second, None] + (1.0 - off) * (vertices - centre[second, None])
         around = winding(smaller.reshape(-1, 3), others.vertices(*look, 12), triangles(others, 12))
+        assert np.abs(around).max() < 0.5
+
+
+OUTLINES = {
+    "rectangle": lambda c: wy.outline.rectangle(*c.size, center=c.middle),
+    "bias": lambda c: wy.outline.rectangle(7e-3, 3.5e-3, angle=45.0, center=c.middle),
+    "disc": lambda c: wy.outline.disc(3.3e-3, center=c.middle),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", OUTLINES)
+@pytest.mark.parametrize("weaves, radius", [("plain", 3.3e-4), ("plain", 5e-4), ("2/2 twill", 4.5e-4)])
+def test_free_ends_are_whole_and_in_no_other_yarn(weaves, shape, radius):
+    """Of what is cut out of a flat cloth: the sections of free ends are those of the yarn, and a quarter less of them
+    is outside of all yarns of the other direction."""
+    size = 6 if shape == "rectangle" else 11
+    weave = wy.Weave.from_notation(weaves, rows=size, columns=size)
+    yarns_of_both = [wy.Yarn(density=5e-5, stretch=1e7, bend=0.05)] * 2
+    whole = wy.Cloth(weave, yarns=yarns_of_both, warp=[0] * size, weft=[1] * size, radius=radius, pose="flat")
+    cloth = whole.cut(OUTLINES[shape](whole))
+    weaving = yarns.Weaving(cloth)
+    look = weaving.look(cloth.position)
+    tubes = [yarns.Tubes.around(strands, samples=4) for strands in weaving.strands]
+    for one, others in (tubes, tubes[::-1]):
+        crossed = one.strands.across[:, 0] > 0.0
+        ends = crossed[one.points].sum(axis=1) == 1
+        np.testing.assert_allclose(one.half[ends], radius, rtol=1e-12)
+        centre, _ = one.rings(*look)
+        smaller = centre[:, None] + 0.75 * (one.vertices(*look, 8).reshape(-1, 8, 3) - centre[:, None])
+        around = winding(smaller[ends].reshape(-1, 3), others.vertices(*look, 8), triangles(others, 8))
         assert np.abs(around).max() < 0.5
 
 

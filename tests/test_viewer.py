@@ -105,7 +105,8 @@ def test_what_the_browser_is_sent_is_where_yarns_are():
         assert 1.0 < ratio * np.ptp(points, axis=0).max() < 1.3
         moved = np.array(sent["/obstacles/sphere_0"].position) - before
         np.testing.assert_allclose(moved[:2], 0.0, atol=1e-12)
-        assert moved[2] == pytest.approx(4e-4 * ratio, rel=0.05)
+        # free ends that slope reach farther than their points
+        assert moved[2] == pytest.approx(4e-4 * ratio, rel=0.15)
 
 
 @pytest.mark.parametrize(

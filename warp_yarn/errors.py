@@ -119,6 +119,13 @@ def integer(name: str, value: Any, *, least: int, most: int | None = None) -> in
     return int(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """Gives value as True or False, or an InputError: text such as "no" would be taken for True."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} = {brief(value)}, must be True or False")
+    return bool(value)
+
+
 def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
     """Gives value, or an InputError where it is none of the allowed names."""
     names = list(allowed)

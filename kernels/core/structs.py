@@ -11,6 +11,9 @@ import warp as wp
 
 from .variant import Variant
 
+ONCE = -2
+"""``evaluations`` where there is one matrix a step, an even number as that of a first evaluation."""
+
 
 @functools.cache
 def structs(variant: Variant) -> SimpleNamespace:

@@ -33,7 +33,7 @@ The matrix is the exact second derivative of W in the positions, without what co
 warp and weft are coupled through h by four coordinates that the matrix has no place for. Every other evaluation has
 the coupling within each yarn alone, which is never less than half of the exact matrix; those between have that of the
 positions, with Δs held. Newton's iteration needs both: in the one a cloth that draws in is too stiff, in the other a
-yarn that slides.
+yarn that slides. Methods that take one matrix a step have twice the first.
 """
 
 import functools
@@ -43,10 +43,13 @@ import warp as wp
 
 from ..core import general
 from ..core.indexing import index
-from ..core.structs import structs
+from ..core.structs import ONCE, structs
 from ..core.variant import Term, Variant
 from . import bending, crimped_segment, stretch
 
+ENOUGH = 2.0
+"""Times the coupling within each yarn, that it is no less than the exact matrix: methods that take one matrix a step
+would gain energy of less."""
 HELD = 10.0
 """How much stiffer Δs are in the matrix of the positions: they are left for the other one to move."""
 
@@ -274,12 +277,17 @@ def define(variant: Variant) -> wp.Kernel:
             by_p = vec4()
             by_rest = vec4()
             curvature = scalar(0.0)
+            enough = scalar(1.0)
+            if wp.static(sliding):
+                if blocks.evaluations[0] == ONCE:
+                    enough = scalar(ENOUGH)
             for side in range(4):
                 code = crimp.crimp_sides[i][side]
                 if code != 0:
                     yarn = side / 2
                     part = scalar(0.5) * wp.abs(scalar(code)) * factor
                     if code > 0:
+                        part *= enough
                         mine = h
                         sign = scalar(1.0)
                         if side > 1:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from warp_yarn.kernels import Variant, build
 import warp_yarn as wy
 from warp_yarn.device.declarations import FIELDS, GROUPS, LEVELS, TOPOLOGY
 from warp_yarn.device.declared import Struct
-from warp_yarn.device.fields import Field
+from warp_yarn.device.fields import Field, known_conditions
 
 VARIANTS = [Variant(*kind) for kind in itertools.product((wp.float64, wp.float32), (True, False), (True, False))]
 VARIANTS += [dataclasses.replace(variant, general=True) for variant in VARIANTS[:4]]
@@ -70,6 +72,15 @@ def test_every_declaration_is_some_kernels_argument():
 def test_groups_share_no_name():
     names = [name for group in GROUPS.values() for name in group]
     assert len(names) == len(set(names))
+
+
+def test_every_condition_is_known_and_of_use():
+    """One that is misspelt never holds, and its arrays are never there."""
+    known = set(known_conditions(scene("plain", None, True), VARIANTS[0], []))
+    device = Path(wy.__file__).parent / "device"
+    asked = re.findall(r'"([^"]+)" in [\w.]*\bconditions\b', "".join(file.read_text() for file in device.glob("*.py")))
+    assert len(asked) > 10
+    assert {field.when for field in FIELDS.values()} | set(asked) == known
 
 
 @pytest.mark.parametrize(

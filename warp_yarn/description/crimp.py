@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, choice
+from ..errors import InputError, WarpYarnWarning, choice
 from .woven import Woven
 
+if TYPE_CHECKING:
+    from .cloth import Cloth
+
 CONTACT_FORCES = ("published", "crimped")
+UNLIKE = 1.25
+"""Times by which heights and thicknesses of yarns differ that hardly are of one cloth."""
 ROUND = 9.0 / 8.0
 """β², by which yarns are round at their bends, as of ``kernels/terms/crimped_segment.py``."""
 
@@ -31,14 +39,46 @@ def crimp_height(distance: Any, length: Any) -> Any:
 
 
 def heights(cloth: Woven) -> np.ndarray:
-    """Computes how high every yarn rises as woven, over the mean of the distances that it covers [yarns] (m)."""
-    yarn = cloth.topology.segment_yarn
-    distance = np.bincount(yarn, cloth.segment_spacing) / np.bincount(yarn)
+    """Computes how high every yarn rises as woven, over the mean of the distances between those that it crosses, of one
+    that crosses a single one those of its ends [yarns] (m)."""
+    topology, yarn = cloth.topology, cloth.topology.segment_yarn
+    between = (topology.is_end[topology.segment_nodes] == 0).all(axis=1)
+    counted = between | (np.bincount(yarn, between)[yarn] == 0)
+    distance = np.bincount(yarn, cloth.segment_spacing * counted) / np.bincount(yarn, counted)
     return crimp_height(distance, distance * (1.0 + cloth.yarn_crimp))
 
 
-def check_crimp(cloth: Woven, contact_force: str, interchange: bool) -> None:
-    """Refuses what a scene says of crimp where it does not go together, or the cloth is not for it.
+def room(cloth: Woven) -> float:
+    """Computes how high yarns rise together as woven, h₁ + h₂, over their thicknesses d₁ + d₂, the mean of crossings: 1
+    where crimp interchange leaves the cloth at rest."""
+    yarns = cloth.node_yarns[cloth.topology.crossing_node]
+    return float((heights(cloth)[yarns].sum(axis=1) / (2.0 * cloth.halves[yarns, 1]).sum(axis=1)).mean())
+
+
+def pressed(cloth: Cloth) -> Cloth:
+    """Makes a cloth of yarns as thick as their crimps leave room for: see ``Cloth.pressed``."""
+    if not cloth.yarn_crimp.any():
+        raise InputError("pressed: the cloth has no crimp, must be above 0 in the warp or the weft")
+    factor, yarns = room(cloth), []
+    for yarn in cloth.yarns:
+        half_width, half_thickness = yarn.halves(cloth.radius)
+        yarns.append(
+            dataclasses.replace(
+                yarn,
+                # kₛ and k_b of a section by this factor
+                stretch=yarn.stretch / factor,
+                bend=yarn.bend / factor,
+                radius=None,
+                width=2.0 * half_width,
+                thickness=2.0 * factor * half_thickness,
+            )
+        )
+    return cloth.replace(yarns=yarns)
+
+
+def check_crimp(cloths: Sequence[Woven], contact_force: str, interchange: bool) -> None:
+    """Refuses what a scene says of crimp where it does not go together, or a cloth is not for it, and warns of cloths
+    that crimp interchange does not leave as they are woven.
 
     Raises:
         InputError: the argument, its value, and what it must be.
@@ -49,14 +89,25 @@ def check_crimp(cloth: Woven, contact_force: str, interchange: bool) -> None:
         raise InputError(
             "contact_force = 'crimped', must be 'published' with crimp_interchange, whose contact force is its own"
         )
-    if (interchange or crimped) and not cloth.yarn_crimp.any():
-        wanted = "crimp_interchange = True" if interchange else "contact_force = 'crimped'"
-        raise InputError(f"{wanted}, but the cloth has no crimp, must be above 0 in the warp or the weft")
-    for k, yarn in enumerate(cloth.yarns):
-        if interchange and yarn.bend == 0.0:
-            raise InputError(
-                f"crimp_interchange = True, but yarns[{k}].bend = 0, must be above 0: nothing would say how high a "
-                "slack yarn is"
+    wanted = "crimp_interchange = True" if interchange else "contact_force = 'crimped'"
+    for number, cloth in enumerate(cloths if interchange or crimped else ()):
+        name = "the cloth" if len(cloths) == 1 else f"cloths[{number}]"
+        if not cloth.yarn_crimp.any():
+            raise InputError(f"{wanted}, but {name} has no crimp, must be above 0 in the warp or the weft")
+        for k, yarn in enumerate(cloth.yarns):
+            if interchange and yarn.bend == 0.0:
+                raise InputError(
+                    f"crimp_interchange = True, but yarns[{k}].bend = 0, must be above 0: nothing would say how high a "
+                    "slack yarn is"
+                )
+        factor = room(cloth) if interchange else 1.0
+        if not 1.0 / UNLIKE <= factor <= UNLIKE:
+            warnings.warn(
+                f"crimp_interchange = True: yarns of {name} rise {factor:.2g} times their thicknesses as they are "
+                f"crimped, so it {'draws in' if factor < 1.0 else 'spreads'} at once: cloth.pressed() makes them as "
+                "thick as there is room for",
+                WarpYarnWarning,
+                stacklevel=3,
             )
 
 

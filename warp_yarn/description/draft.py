@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, finite_array, integer
+from ..errors import InputError, finite_array, flag, integer
 from .cloth import Cloth
 from .fixed import Replaceable, says_why
 from .weave import MOST_CROSSINGS, Weave
@@ -66,7 +66,7 @@ class Draft(Replaceable):
             keep("tieup", _groups("tieup", self.tieup, MOST_THREADS, least=0))
         treadles = MOST_THREADS if self.tieup is None else len(self.tieup)
         keep("treadling", _groups("treadling", self.treadling, treadles))
-        keep("rising", bool(self.rising))
+        keep("rising", flag("rising", self.rising))
         for squares, what in ((self.ends, "ends"), (self.shafts, "shafts")):
             if self.picks * squares > MOST_CROSSINGS:
                 raise InputError(f"{self.picks} picks × {squares} {what}, must be at most {MOST_CROSSINGS} squares")

@@ -37,6 +37,8 @@ def piece(
         raise InputError(
             f"fabric = {fabric!r}, must be a function that makes a Cloth, such as wy.fabrics.denim, not called"
         )
+    for name in sorted({"rows", "columns", "size"} & set(options)):
+        raise InputError(f"{name} = {options[name]!r}: a piece is as large as its outline needs, must be left out")
     corners = checked_polygon("outline", outline)
     low, high = corners.min(axis=0), corners.max(axis=0)
     sample = fabric(rows=3, columns=3, **options)

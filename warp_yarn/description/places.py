@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import InputError, choice, finite_array
 from .coarse import coarsened
+from .crimp import pressed
 from .cutting import Cut, between, cut
 from .outline import checked_outline, checked_polygon, inside, tolerance
 from .topology import Topology
@@ -132,6 +133,19 @@ class Places(Woven):
             InputError: another n; a cloth that is cut.
         """
         return coarsened(self, n)  # type: ignore[arg-type,return-value]
+
+    def pressed(self) -> Self:
+        """Makes the same cloth of yarns as thick as their crimps leave room for, so that ``crimp_interchange`` leaves
+        it at rest as it is woven.
+
+        All thicknesses are taken by the same factor, that h₁ + h₂ of the crimps as woven is d₁ + d₂ at the mean
+        crossing; widths, mass, tension and bending stiffness of each yarn stay. Yarns of data sheets are round, and
+        mostly thicker than they are in the cloth.
+
+        Raises:
+            InputError: yarns have no crimp.
+        """
+        return pressed(self)  # type: ignore[arg-type,return-value]
 
     @property
     def lines(self) -> tuple[np.ndarray, np.ndarray]:

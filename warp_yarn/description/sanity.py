@@ -14,6 +14,7 @@ from ..errors import WarpYarnWarning, real
 if TYPE_CHECKING:
     from .cloth import Cloth
     from .scene import Scene
+    from .woven import Woven
 
 DISTANCE = (1e-5, 5e-2)
 """Of neighbouring yarns that anyone weaves or stands for others by [m]: from fine filaments to nets."""
@@ -29,6 +30,9 @@ SPEED = 350.0
 """Of wind [m/s], beyond sound: 10 m/s are 1000 cm/s."""
 STEP = 0.2
 """Of time [s]: films have 24 frames a second; longer steps look for equilibrium."""
+ROUNDED = 20.0
+"""Weights of a node, by which single precision may round the pull of a yarn: at some 30 cloth is a hundredth off its
+way, and at 200 a quarter."""
 
 FAR = 3.0
 """In spacings: from how far on what is drawn together, or moved, in the first step is not near."""
@@ -68,6 +72,25 @@ def _sizes(cloth: Cloth) -> Iterator[tuple[str, list[float], tuple[float, float]
         yield "radius", round_ones, RADIUS
     for name in ("width", "thickness") if flat else ():
         yield name, [getattr(yarn, name) for yarn in flat], diameter
+
+
+def warn_of_rounding(cloth: Woven) -> None:
+    """Warns the caller's caller where positions in single precision make more of stiff yarns' pull than of a node's
+    weight."""
+    topology, material = cloth.topology, cloth.material[cloth.topology.segment_yarn]
+    section = np.pi * cloth.halves[topology.segment_yarn].prod(axis=1)
+    stretch = np.array([yarn.stretch for yarn in cloth.yarns])[material] * section
+    # a coordinate of the cloth, counted from its middle, is rounded by half of the last place
+    off = 0.5 * float(np.finfo(np.float32).eps) * 0.5 * float(np.ptp(cloth.position, axis=0).max())
+    pull = float((stretch / cloth.segment_spacing).max()) * off
+    weight = 9.8 * cloth.mass / topology.nodes
+    if pull > ROUNDED * weight:
+        warnings.warn(
+            f"precision = 'single' rounds the pull of a yarn by {pull:.2g} N, {pull / weight:.2g} times the weight of "
+            f"a node, usual is at most {ROUNDED:g} times: these yarns are stiff and light, take 'double'",
+            WarpYarnWarning,
+            stacklevel=3,
+        )
 
 
 def warn_of_acceleration(gravity: Any) -> None:

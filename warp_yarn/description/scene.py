@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, finite_array, indices, real
+from ..errors import InputError, finite_array, flag, indices, real
 from ..kernels import TERMS, TermParameter, own
 from .cloth import Cloth
 from .cloths import Cloths, as_one
@@ -85,7 +85,8 @@ class Scene(Fixed):
             those of the straight segments; "crimped", of segments that rise by the crimp of the yarns, so that a flat
             cloth's feels their tension.
         crimp_interchange: whether yarns that are crimped straighten at each other's expense before they stretch: the
-            term of that name, in place of stretch, with a contact force of its own. Yarns must be crimped as woven.
+            term of that name, in place of stretch, with a contact force of its own. Yarns must be crimped as woven,
+            and as thick as they rise by that: ``cloth.pressed()``.
     """
 
     def __init__(
@@ -126,22 +127,23 @@ class Scene(Fixed):
         self.force_path = _force_path(checked)
         self.seams = checked_seams(seams, self.cloth.nodes)
         self.seam_stiffness = real("seam_stiffness", seam_stiffness, above=0.0)
-        if len(self.seams) and self_contact:
+        if len(self.seams) and flag("self_contact", self_contact):
             raise InputError("seams with self_contact=True, must be False: it would hold apart what is sewn together")
-        self.sliding = bool(sliding)
-        self.published_scaling = bool(published_scaling)
+        self.sliding = flag("sliding", sliding)
+        self.published_scaling = flag("published_scaling", published_scaling)
         self._parameters = checked_parameters(parameters, len(self.cloth.yarns))
         if not isinstance(obstacles, Sequence) or not all(isinstance(obstacle, Obstacle) for obstacle in obstacles):
             raise InputError(f"obstacles = {obstacles!r}, must be a list of Plane, Sphere, Capsule, Cylinder, Box, ...")
         self.obstacles = tuple(obstacles)
-        self.self_contact = bool(self_contact)
+        self.self_contact = flag("self_contact", self_contact)
         if contact is not None and not isinstance(contact, Contact):
             raise InputError(f"contact = {contact!r}, must be a Contact or None")
         self.contact = Contact() if contact is None else contact
         self.contact.check_obstacles(self.obstacles)
         self.contact_force = contact_force
-        self.crimp_interchange = bool(crimp_interchange)
-        check_crimp(self.cloth, contact_force, self.crimp_interchange)
+        self.crimp_interchange = flag("crimp_interchange", crimp_interchange)
+        cloths = self.cloth.cloths if isinstance(self.cloth, Cloths) else (self.cloth,)
+        check_crimp(cloths, contact_force, self.crimp_interchange)
         self.terms = selected_terms(self, terms)
         warn_of_acceleration(self.gravity)
         warn_of_distances(self)

@@ -15,6 +15,11 @@ from . import declarations
 if TYPE_CHECKING:
     from .model import Model
 
+MEMORY = ("bounds", "steps_to_audit", "audit_due", "alert", "outer_force")
+"""What it writes down of steps, for those that come; outer_force where outer forces do work."""
+LOOKED_AT = ("elastic_energy", "height_energy")
+SAME = {wp.float64: 1e-9, wp.float32: 1e-4}
+"""Part of energies that rounding, also of where pins are, makes of the same ones."""
 AT_END, AT_START = 2, 3
 """The places of a step's end and start among ``stage_times``, behind those of two stages."""
 
@@ -43,6 +48,33 @@ class EnergyWatch:
         for name, value in (("audit_due", 1), ("alert", 0)):
             self.model.arrays.put(name, value)
         self.model.arrays.put("bounds", 0.0, 0.0, 0.0, -math.inf, 0.0, 0.0, 0.0)
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """Copies what it has written down, and the energies that it looks at every step."""
+        a = self.model.arrays
+        return {name: a[name].numpy().copy() for name in (*MEMORY, *LOOKED_AT) if name in a}
+
+    def recall(self, memory: dict[str, np.ndarray]) -> None:
+        """Goes back to what ``memory`` gave."""
+        for name in MEMORY:
+            if name in memory and name in self.model.arrays:
+                self.model.arrays[name].assign(memory[name])
+
+    def go_on(self, memory: dict[str, np.ndarray], steps_done: int) -> None:
+        """Goes on from what another one's ``memory`` gave after so many steps, if the energies of the present state
+        are what they were there: by other inputs, or numbers that were changed by hand, it begins anew."""
+        a = self.model.arrays
+        shapes = {name: value.shape for name, value in self.memory().items()}
+        if not self.on or shapes != {name: memory[name].shape for name in shapes if name in memory}:
+            return
+        a.put("counters", 0, steps_done)
+        if self.model.inputs.move:
+            self.model.inputs.load(AT_START)
+        a.zero(*LOOKED_AT)
+        self._add_energies(cheap=True)
+        off = max(abs(float(a[name].numpy()[0] - memory[name][0])) for name in LOOKED_AT)
+        if off <= SAME[a.variant.scalar] * max(abs(float(memory[name][0])) for name in LOOKED_AT):
+            self.recall({name: memory[name].astype(a[name].numpy().dtype) for name in shapes})
 
     def trust(self) -> None:
         """Lets all steps pass, until ``forget``: steps that are made again, from the middle of a run, were

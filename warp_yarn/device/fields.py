@@ -43,11 +43,16 @@ Group = dict[str, Field]
 
 
 def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
-    """Find the conditions that hold for a scene, which ``Field.when`` names."""
+    """Find the conditions that hold for a scene, of those that ``Field.when`` may name."""
+    return {name for name, value in known_conditions(scene, variant, terms).items() if value}
+
+
+def known_conditions(scene: Scene, variant: Variant, terms: list[Term]) -> dict[str, bool]:
+    """Look whether each condition that there is holds for a scene."""
     names = {term.name for term in terms}
     # which may read any index array
     others = any(not own(term) for term in terms)
-    holds = {
+    return {
         "always": True,
         "sliding": variant.sliding,
         "general": variant.general,
@@ -74,4 +79,3 @@ def conditions(scene: Scene, variant: Variant, terms: list[Term]) -> set[str]:
         "crimp interchange": "crimp_interchange" in names,
         "crimped contact": scene.contact_force == "crimped",
     }
-    return {name for name, value in holds.items() if value}

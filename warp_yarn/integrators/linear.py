@@ -9,6 +9,7 @@ import warp as wp
 from ..device import declarations
 from ..device.graphs import GraphCache
 from ..device.model import BETWEEN, MATRIX, Model
+from ..kernels.core.structs import ONCE
 from .made import Made, Point, subtract_product
 
 
@@ -29,10 +30,13 @@ class LinearlyImplicitEuler:
     def __init__(self, model: Model):
         self.model = model
         self._graphs = GraphCache(model.device)
+        model.arrays.put("evaluations", ONCE)
 
     def set_times(self, step: float, remaining: float) -> None:
         """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         self.model.set_times(step, remaining, step)
+        # what iterates, such as relax(), leaves another number there
+        self.model.arrays.put("evaluations", ONCE)
 
     def advance(self) -> None:
         """Makes a step, and records it. Impact zones are the host's, between two graphs."""
@@ -66,7 +70,7 @@ class LinearlyImplicitEuler:
 
     def assemble_made(self, stage: int) -> None:
         """Assembles what is left of a solve that was made: b − A w, in place of the right-hand side."""
-        self.model.arrays.zero("evaluations")
+        self.model.arrays.put("evaluations", ONCE)
         self._assemble_stage(stage)
         subtract_product(self.model)
 

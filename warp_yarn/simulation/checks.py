@@ -13,6 +13,7 @@ from ..description.scene import Scene
 from ..errors import InputError, brief, integer, real
 from ..integrators import INTEGRATORS
 from ..integrators.linear import LinearlyImplicitEuler
+from ..integrators.ros2 import ROS2
 from ..integrators.stage import StageMethod
 from .state import State
 
@@ -79,6 +80,19 @@ def check_contact(scene: Scene, integrator: str) -> None:
         raise InputError(
             f"integrator = {integrator!r} with contact: a step may end inside something; must be one of {able}, or "
             "contact.method 'impact-zones' with 'linear'"
+        )
+
+
+def check_sliding_crimp(scene: Scene, integrator: str) -> None:
+    """Refuses crimp interchange of yarns that slide with a method that takes the matrix for exact.
+
+    Raises:
+        InputError: such a method.
+    """
+    if integrator == ROS2.name and isinstance(scene, Scene) and scene.crimp_interchange and scene.sliding:
+        raise InputError(
+            f"integrator = {integrator!r} with crimp_interchange and sliding: it takes the matrix for exact, which has "
+            "no place for how warp and weft are coupled; must be sliding=False, or another integrator"
         )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import tqdm
 
 from ..description.scene import Scene
+from ..device.exclusive import ALONE
 from ..errors import InputError
 from ..io.files import deferred
 from ..io.films import RECORDINGS, film, open_films
@@ -170,6 +171,8 @@ class Filming:
         simulator.steps_done = recording.steps_done
         if end is not None:
             simulator.substepping.next_size = end.next_size
+            with ALONE:
+                simulator.stepper.model.energy.go_on(end.watched, end.steps_done)
         return simulator
 
     @property
@@ -194,10 +197,10 @@ class Filming:
     def _record(self, pace: Pace) -> None:
         self.stepper.frames.record(pace, self.stepper.steps_done)
 
+    @alone
     def _end(self) -> End:
         """Gives what a run goes on from that ends here."""
-        with self.lock:
-            return End(self.state, self.steps_done, self.substepping.next_size)
+        return End(self.state, self.steps_done, self.substepping.next_size, self.stepper.model.energy.memory())
 
 
 class Walk:

@@ -187,8 +187,8 @@ class Frames:
         recording = self.recording
         if recording is None or not recording.open or recording.last != steps_done:
             return None
-        filled, steps = recording.kept
+        filled, _ = recording.kept
         frames = recording.trajectory.cut(filled)
-        if filled and recording.pace.places(filled - 1, filled)[0] != steps:
-            frames.end = End(self.state(), steps_done, next_size)
+        if filled:
+            frames.end = End(self.state(), steps_done, next_size, self.model.energy.memory())
         return frames

@@ -11,6 +11,7 @@ from ..device.contact import Near
 from ..device.model import Model
 from ..errors import InputError
 from ..kernels.core.status import CROWDED
+from ..kernels.core.structs import ONCE
 from .alone import alone
 from .checks import checked_state
 from .contacts import Contacts, contacts_of
@@ -189,7 +190,7 @@ class Inspection:
         """
         h = self.model.step_size
         with Visit(self.stepper, state, ahead=True):
-            self.model.arrays.zero("evaluations")
+            self.model.arrays.put("evaluations", ONCE)
             self.model.arrays.put("coefficients", *(weights or (1.0, h, h * h)))
             with_room(self.stepper, self.model.assemble)
             return read_system(self.model)

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from ..device.declarations import FRAMES
+from ..device.energy_watch import MEMORY
 from ..device.model import Model
 from ..errors import InputError, WarpYarnWarning
 from ..integrators.made import Made, Point
 from .inspection import Visit, with_room
 from .state import State, Trajectory
-from .stepper import LEDGER, Stepper
+from .stepper import Stepper
 
 GIVES_WAY = 0.01
 """Of the way that a pin was moved: from where on a spring that falls short by so much turns what a test reads."""
@@ -208,7 +209,7 @@ def remade(stepper: Stepper, *, gained: bool, size: float) -> list[Part]:
         at.append(found[-1].after)
 
     frame, row = (int(value) for value in a["counters"].numpy())
-    kept = {name: a[name].numpy().copy() for name in (*LEDGER, *FRAMES) if a.get(name) is not None}
+    kept = {name: a[name].numpy().copy() for name in (*MEMORY, *FRAMES) if a.get(name) is not None}
     counts, watcher = parts.counts, parts.watcher
     stepper.model.energy.forget()
     a.put("status", 0, 0, 0)

@@ -8,15 +8,24 @@ from typing import Any
 
 import numpy as np
 
+from ..description.sanity import warn_of_rounding
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
 from ..device.model import Model
-from ..errors import InputError, choice, integer
+from ..errors import InputError, choice, flag, integer
 from ..integrators import INTEGRATORS
 from ..kernels import parameters
 from ..moved import renamed_attribute
 from .alone import alone
-from .checks import LARGEST, check_contact, checked_chunk, checked_state, checked_step_error, warn_of_threads
+from .checks import (
+    LARGEST,
+    check_contact,
+    check_sliding_crimp,
+    checked_chunk,
+    checked_state,
+    checked_step_error,
+    warn_of_threads,
+)
 from .diagnosis import Failure
 from .film import DECIDING, Filming, bar
 from .frames import Frames
@@ -135,6 +144,8 @@ class Simulator(Loads, Filming):
             self.stepper.frames.options = {name: self._options[name] for name in DECIDING}
         self.check_clear()
         warn_of_threads(threads)
+        if precision == "single":
+            warn_of_rounding(scene.cloth)
 
     parts = renamed_attribute("parts", "substepping")
 
@@ -144,7 +155,7 @@ class Simulator(Loads, Filming):
             names = [name for name in (*BESIDE_TERMS, *parameters()) if name in self.arrays]
             values = {name: self.arrays[name].numpy().copy() for name in names}
             steps = (self.steps_done, dict(self.split_steps), set(self.damped_steps))
-            rest = (self.state, *steps, self.substepping.next_size, values)
+            rest = (self.state, *steps, self.substepping.next_size, values, self.model.energy.memory())
         return _rebuilt, (type(self), self.scene, self._options, *rest)
 
     @alone
@@ -254,14 +265,16 @@ def _made(
     method: Any = INTEGRATORS[choice("integrator", integrator, INTEGRATORS)]
     if max_iterations is not None:
         integer("max_iterations", max_iterations, least=1, most=LARGEST)
+    energy_watch, differentiable = flag("energy_watch", energy_watch), flag("differentiable", differentiable)
     step_error = checked_step_error(step_error, integrator, differentiable)
     check_contact(scene, integrator)
+    check_sliding_crimp(scene, integrator)
     if hook is not None and not callable(hook):
         raise InputError(f"hook = {hook!r}, must be a function of the simulator, or None")
     hooked = hook is not None
     model = Model(scene, max_iterations=max_iterations, differentiable=differentiable, hooked=hooked, **options)
-    model.energy.on = model.energy.on and bool(energy_watch)
-    model.contact.damps_impacts = bool(energy_watch)
+    model.energy.on = model.energy.on and energy_watch
+    model.contact.damps_impacts = energy_watch
     refuse_recording(model.device)
     at_once = method(model)
     if step_error is not None:
@@ -286,6 +299,7 @@ def _rebuilt(
     damped_steps: set[int],
     size: float,
     values: dict[str, np.ndarray],
+    watched: dict[str, np.ndarray],
 ) -> Simulator:
     """Makes a simulator as another was when it was copied or pickled."""
     result = kind(scene, **options)
@@ -293,6 +307,7 @@ def _rebuilt(
         for name, value in values.items():
             result.arrays[name].assign(value)
         result.stepper.frames.upload(state)
+        result.model.energy.go_on(watched, steps_done)
     stepper = result.stepper
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size

@@ -67,6 +67,8 @@ class State:
 FIELDS = tuple(field.name for field in dataclasses.fields(State))
 WIDTHS = {"position": 3, "euler": 2, "velocity": 3, "euler_velocity": 2, "anchor": 2}
 """Numbers of a node."""
+WATCHED = "end_watched_"
+"""Before the names of what the watch over energy has written down, in recordings."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,11 +79,13 @@ class End:
         state: after a whole step, in double precision.
         steps_done: steps until then.
         next_size: of the next part of a step, in steps, where steps follow their error.
+        watched: what the watch over energy has written down, by name.
     """
 
     state: State
     steps_done: int
     next_size: float = 1.0
+    watched: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(eq=False)
@@ -239,6 +243,7 @@ class Trajectory:
             state = end.state.checked(self.cloth.nodes)
             values |= {"end_steps": end.steps_done, "end_next_size": end.next_size}
             values |= {f"end_{name}": getattr(state, name) for name in FIELDS}
+            values |= {f"{WATCHED}{name}": value for name, value in end.watched.items()}
         if self.options is not None:
             values["options"] = json.dumps(self.options, default=float)
         known = {} if scene is None or scene.functions else packed(scene)
@@ -254,7 +259,8 @@ class Trajectory:
         if "end_steps" in data:
             state = State(**{name: data[f"end_{name}"] for name in FIELDS}).checked(cloth.nodes)
             steps = integer("end_steps", data["end_steps"].item(), least=0)
-            end = End(state, steps, real("end_next_size", data["end_next_size"].item(), above=0.0))
+            watched = {name.removeprefix(WATCHED): data[name] for name in data if name.startswith(WATCHED)}
+            end = End(state, steps, real("end_next_size", data["end_next_size"].item(), above=0.0), watched)
         start = real("start", data["start"].item(), least=0.0) if "start" in data else 0
         every = real("every", data["every"].item(), above=0.0) if "every" in data else 1
         empty: dict[str, Any] = {name: np.empty((0, cloth.nodes, width)) for name, width in WIDTHS.items()}

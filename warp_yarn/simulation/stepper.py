@@ -20,9 +20,6 @@ from .hooks import prepare
 from .state import State
 from .substepping import Substepping
 
-LEDGER = ("bounds", "steps_to_audit", "audit_due", "alert", "outer_force")
-"""Arrays of the watch over energy that one step leaves to the next."""
-
 
 @dataclasses.dataclass(frozen=True)
 class _StepInParts:
@@ -130,8 +127,7 @@ class Stepper:
             self.damped_steps.discard(base + parted.frame + 1)
             with ALONE:
                 self.arrays.put("damps", 0)
-                for name, value in parted.ledger.items():
-                    self.arrays[name].assign(value)
+                self.model.energy.recall(parted.ledger)
         self.integrator.set_times(self.model.step_size, self.model.step_size)
         self.frames.restore(made)
         self.frames.keep(base, made)
@@ -211,9 +207,8 @@ class Stepper:
 
     def _make_in_parts(self, frame: int) -> bool:
         """Makes the step after a frame of the chunk in parts; where that fails too, ``status`` says what it was."""
-        ledger = {name: self.arrays[name].numpy().copy() for name in LEDGER if name in self.arrays}
         parts = self.substepping
-        self._step_in_parts = _StepInParts(frame, parts.counts, ledger)
+        self._step_in_parts = _StepInParts(frame, parts.counts, self.model.energy.memory())
         gained, damped, whole = False, parts.damped, parts.allowed is None
         while whole and self._status() == CROWDED:
             self.make_room()

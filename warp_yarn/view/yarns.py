@@ -2,7 +2,8 @@
 
 At a crossing a warp yarn passes at x − b n and a weft yarn at x + b n, b half the height of its own section and n the
 contact normal from warp to weft; at the edge n is that of the two yarns that meet there. A yarn that ends where it
-crosses another one goes on a little, as a cut yarn does.
+crosses another one goes on a little, as a cut yarn does. A free end lies on the last yarn that it crosses, and goes
+straight from there.
 
 A *place* is a node, the tip of a free end, or the turn of a selvedge; strands are rows of places.
 """
@@ -15,6 +16,7 @@ import numpy as np
 
 from ..description.cloth import Cloth
 from ..description.cloths import Cloths
+from .free_ends import clear, rested, trims
 from .geometry import PALETTE, contact_normals
 
 FREE_END = 0.4
@@ -99,6 +101,7 @@ class Weaving:
             self._yarn[d, a] = self._yarn[d, b] = topology.segment_yarn[along == d]
         self.crossed = np.logical_and(*(self._yarn >= 0))
         self._side = np.where(_flipped(cloth), -1.0, 1.0)
+        self._trim = trims(cloth)
         self._half = cloth.halves
         self._tips: list[tuple[int, int, float]] = []
         self._turns: list[tuple[int, int]] = []
@@ -169,13 +172,22 @@ class Weaving:
         crossed, other = self.crossed[nodes], self._yarn[1 - d, nodes]
         side = (2 * d - 1) * self._side[nodes] * crossed
         piece = {
-            "places": nodes,
+            "places": nodes.copy(),
             "height": side * self._half[yarn, 1],
             "arc": self.cloth.euler[nodes, d],
             "arc_of": np.stack([nodes, np.full_like(nodes, d)], axis=1),
             "arc_sign": np.ones(len(nodes)),
             "across": np.where(crossed[:, None], np.c_[self._half[other], -side * self._half[other, 1]], 0.0),
         }
+        for end, beside in ((0, 1), (-1, -2)):
+            if self.cloth.topology.is_end[nodes[end]]:
+                last, before = int(nodes[end]), int(nodes[beside])
+                reach = abs(self.cloth.rest_grid[last, d] - self.cloth.rest_grid[before, d]) - self._trim[last]
+                piece["height"][end] = clear(reach, 0.0, self._half[yarn, 1], piece["across"][beside])
+                if self._trim[last] > 0.0:
+                    piece["places"][end] = self.cloth.topology.nodes + len(self._tips)
+                    piece["arc"][end] -= (1 if end else -1) * self._trim[last] * (1.0 + self.cloth.yarn_crimp[yarn])
+                    self._tips.append((last, before, -self._trim[last]))
         for end in (0, -1):
             if crossed[end]:
                 last, before = nodes[end], nodes[1 if end == 0 else -2]
@@ -183,7 +195,8 @@ class Weaving:
                 reach = float(self._half[other[end], 0] + FREE_END * gap)
                 tip = {name: value[[end]] for name, value in piece.items()}
                 tip["places"] = np.array([self.cloth.topology.nodes + len(self._tips)])
-                tip["height"], tip["across"] = np.zeros(1), np.zeros((1, 3))
+                tip["height"] = np.array([clear(reach, 0.0, self._half[yarn, 1], tip["across"][0])])
+                tip["across"] = np.zeros((1, 3))
                 length = reach * (1.0 + self.cloth.yarn_crimp[yarn])
                 tip["arc"] = tip["arc"] + (length if end else -length)
                 self._tips.append((int(last), int(before), reach))
@@ -197,9 +210,8 @@ class Weaving:
 
         def turns(piece: Piece) -> bool:
             """Tells whether it is a weft yarn with a free end at either side."""
-            return bool(topology.yarn_direction[piece["yarn"]]) and bool(
-                piece["places"][[0, -1]].min() >= topology.nodes
-            )
+            tips = piece["places"][[0, -1]] - topology.nodes
+            return bool(topology.yarn_direction[piece["yarn"]]) and all(k >= 0 and self._tips[k][2] > 0.0 for k in tips)
 
         weft = [turns(piece) for piece in pieces]
         joined: Piece = {}
@@ -267,14 +279,24 @@ class Tubes:
         weights = np.stack([one, share, share**2, share**3], axis=1) @ CATMULL_ROM
         slopes = np.stack([0 * one, one, 2 * share, 3 * share**2], axis=1) @ CATMULL_ROM
         near = np.clip(segment[:, None] + np.arange(-1, 3), first[:, None], last[:, None])
-        smooth, steep = share**2 * (3.0 - 2.0 * share), 6.0 * share * (1.0 - share)
+        smooth, steep = _smooth(share), 6.0 * share * (1.0 - share)
         low, high = strands.height[segment], strands.height[segment + 1]
-        height = low + smooth * (high - low)
+        height, rise = low + smooth * (high - low), steep * (high - low)
         half = np.repeat(strands.half, counts, axis=0)
         gap = np.abs(strands.arc[segment + 1] - strands.arc[segment]) / (1.0 + np.repeat(strands.crimp, counts))
-        half[:, 1] = squeezed(share, gap, height, half[:, 1], strands.across[segment], strands.across[segment + 1])
+        before, after = strands.across[segment], strands.across[segment + 1]
+        full = half[:, 1].copy()
+        half[:, 1] = squeezed(share, gap, height, full, before, after)
+        for way, crossed, end, at_end in (
+            (-1.0, after, low, (segment == first) & (before[:, 0] == 0.0)),
+            (1.0, before, high, (segment + 1 == last) & (after[:, 0] == 0.0)),
+        ):
+            ends = at_end & (crossed[:, 0] > 0.0)
+            along = share[ends] if way > 0.0 else 1.0 - share[ends]
+            height[ends], slope = rested(along * gap[ends], gap[ends], end[ends], full[ends], crossed[ends])
+            rise[ends], half[ends, 1] = way * gap[ends] * slope, full[ends]
         places, points = strands.places[near], np.stack([segment, segment + 1], axis=1)
-        return cls(strands, counts, places, weights, slopes, share, height, steep * (high - low), half, points)
+        return cls(strands, counts, places, weights, slopes, share, height, rise, half, points)
 
     def between(self, values: np.ndarray) -> np.ndarray:
         """Interpolates values at the strands' points [points] to the rings [rings]."""
@@ -368,6 +390,11 @@ def squeezed(
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Scales to length 1. Where a yarn has shrunk to a point it has no direction; 0 there keeps its tube finite."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
+
+
+def _smooth(share: np.ndarray) -> np.ndarray:
+    """Goes from 0 to 1, level at both."""
+    return share**2 * (3.0 - 2.0 * share)
 
 
 def _flipped(cloth: Cloth | Cloths) -> np.ndarray:
