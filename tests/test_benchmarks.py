@@ -574,7 +574,7 @@ def test_the_command_takes_a_fabric_by_name(capsys):
         (["--steps", "0"], "--steps = 0"),
         (["--repeats", "0"], "--repeats = 0"),
         (["--step", "0"], "step = 0"),
-        (["--size", "2"], "rows = 2"),
+        (["--size", "2"], "--size = 2, must be a whole number, at least 3"),
         (["--integrator", "magic"], "--integrator"),
     ],
 )

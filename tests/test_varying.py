@@ -536,7 +536,7 @@ def test_gusts_on_the_device_are_of_the_precision(precision):
         simulator = wy.Simulator(scene, precision=precision)
         simulator.run(5)
         ends.append(simulator.state.position)
-    # of 3e-5 m that it falls: the solver's tolerances; in single precision stiff glass is off by 1e-6 to 3e-6 by rounding
+    # of 3e-5 m that it falls: the solver's tolerances; single precision rounds the pull of glass, by 1e-6 to 3e-6 here
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-8 if precision == "double" else 5e-6)
     (other,) = functions.values()
     wanted = "vec3d" if precision == "double" else "vec3f"

@@ -54,6 +54,8 @@ def known_conditions(scene: Scene, variant: Variant, terms: list[Term]) -> dict[
     others = any(not own(term) for term in terms)
     return {
         "always": True,
+        # what a method adds, and not the scene
+        "Newton's iteration": False,
         "sliding": variant.sliding,
         "general": variant.general,
         "contact": any(term.needs_contact for term in terms),
