@@ -132,7 +132,9 @@ def funnel(fabric: str) -> Staged:
     middle = [cloth.node(6, 6)]
     steps = 130
     path = cloth.position[middle] - 20.0 * mesh * np.linspace(1.0 / steps, 1.0, steps)[:, None, None] * UP
-    scene = wy.Scene(cloth, obstacles=[cone], pins=middle, pin_path=path, self_contact=True)
+    # a wall without thickness shows what reaches beyond a node: a yarn that lies on top of another
+    contact = wy.Contact(distance=2.0 * cloth.radius)
+    scene = wy.Scene(cloth, obstacles=[cone], pins=middle, pin_path=path, self_contact=True, contact=contact)
     return Staged(scene, steps, driven=True, view=(0.5, -1.0, 0.9))
 
 
