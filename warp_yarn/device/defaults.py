@@ -16,13 +16,12 @@ PRECONDITIONERS = ("multilevel", "incomplete", "jacobi")
 PRECISIONS = {"double": wp.float64, "single": wp.float32}
 TOLERANCES = {"double": 1e-6, "single": 1e-4}
 """Of linear solves: far under the error of eq. 2's step, 1e-2 of the motion."""
-NEWTON_TOLERANCE = {"double": 2e-3, "single": 2e-2}
-"""Of the change of velocity in a step. Ten times as much saves a tenth of the time, and where yarns have just buckled
-it leaves more than the step's own error; in single precision positions are not worth it."""
-SLOW_MOTION = 1e3
+NEWTON_TOLERANCE = 2e-2
+SLOW_MOTION = 1.2e3
 """k_s h²/(m L) from which on the motion that a step resolves is slow beside the yarns' stretching, and its error
-smaller, as the root of it: so is the tolerance, down to ``TIGHT`` of it."""
-TIGHT = {"double": 1e-2, "single": 1e-1}
+smaller: so is the tolerance, in proportion, down to ``TIGHT`` of it. (As the root of it, it left more than the step's
+own error on stiff cloth that has just buckled.)"""
+TIGHT = {"double": 1e-3, "single": 1e-1}
 STIFF = 2e4
 """k_s h²/(m L) from which on lines on many levels take less time than the incomplete factorization: where a stretch
 wave runs over a hundred crossings in a step."""
@@ -97,11 +96,11 @@ def newton_tolerance(scene: Scene, precision: str, step: float) -> float:
     """Choose the tolerance of implicit stages: what follows the error of steps of this size [s]."""
     rate = stretch_rate(scene)
     fastest = float(rate.max())
-    slow = min(1.0, math.sqrt(SLOW_MOTION) / (fastest * step)) if fastest > 0.0 else 1.0
+    slow = min(1.0, SLOW_MOTION / (fastest * step) ** 2) if fastest > 0.0 else 1.0
     # steps of fewer seconds resolve the yarns' stretching
     resolving = math.inf if precision == "single" or not rate.any() else rate[rate > 0.0].min() / RESOLVED
     resolved = min(1.0, step * resolving) ** 2
-    return max(EXACT, NEWTON_TOLERANCE[precision] * max(TIGHT[precision], slow) * resolved)
+    return max(EXACT, NEWTON_TOLERANCE * max(TIGHT[precision], slow) * resolved)
 
 
 def stretch_rate(scene: Scene) -> np.ndarray:

@@ -52,7 +52,7 @@ class EnergyWatch:
     def memory(self) -> dict[str, np.ndarray]:
         """Copies what it has written down, and the energies that it looks at every step."""
         a = self.model.arrays
-        return {name: a[name].numpy().copy() for name in (*MEMORY, *LOOKED_AT) if name in a}
+        return {name: a.values_of(name).copy() for name in (*MEMORY, *LOOKED_AT) if name in a}
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
         """Goes back to what ``memory`` gave."""

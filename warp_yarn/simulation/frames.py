@@ -77,12 +77,12 @@ class Frames:
         nodes = self.scene.cloth.nodes
         values: dict[str, Any] = {}
         for name, width in STATE_TYPES.items():
-            array = self.arrays[name]
-            values[name] = None if array is None else array.numpy().reshape(nodes, width).astype(np.float64)
+            if self.arrays[name] is not None:
+                values[name] = self.arrays.values_of(name).reshape(nodes, width).astype(np.float64)
         values["position"] += self.arrays.origin
-        if values["euler_velocity"] is None:
+        if "euler_velocity" not in values:
             values["euler_velocity"] = np.zeros((nodes, 2))
-        if values["anchor"] is None:
+        if "anchor" not in values:
             values["anchor"] = values["euler"].copy()
         return State(**values)
 
@@ -108,7 +108,7 @@ class Frames:
         """Copies the first frames of the chunk on the device to where they belong."""
         for name in FIELDS:
             if self.moves(name):
-                kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                kept = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
                 origin = self.arrays.origin if name == "position" else 0.0
                 getattr(trajectory, name)[at : at + count] = kept[:count] + origin
 
@@ -130,7 +130,7 @@ class Frames:
         ends = [self.state(), self.state()]
         for name in FIELDS:
             if self.moves(name):
-                kept = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                kept = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
                 origin = self.arrays.origin if name == "position" else 0.0
                 setattr(ends[0], name, kept[self.filled - 1].astype(np.float64) + origin)
         return ends
@@ -170,7 +170,7 @@ class Frames:
         after, share = np.ceil(places).astype(int), (places - before)[:, None, None]
         for name in FIELDS:
             if self.moves(name) and len(places):
-                made = self.arrays[f"frame_{name}"].numpy().reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+                made = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
                 origin = self.arrays.origin if name == "position" else 0.0
                 # what stands still does so to the last bit
                 kept = made[before] + share * (made[after] - made[before])

@@ -78,9 +78,9 @@ class Simulator(Loads, Filming):
             P the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit
             stages it is that of the adjoint's solves alone.
         newton_tolerance: of an implicit stage: what is left of the velocities to find, relative to their change in the
-            step, as √ of kinetic energies (``docs/solver.md``); None: 2e-3, less where the step resolves the yarns'
-            stretching, as its square, and where yarns are stiff, down to 2e-5; 2e-2 to 2e-3
-            in single precision; and 1e-8 where differentiable.
+            step, as √ of kinetic energies (``docs/solver.md``); None: 2e-2, less where the step resolves the yarns'
+            stretching, as its square, and where yarns are stiff, down to 2e-5, in
+            single precision 2e-3; and 1e-8 where differentiable.
         max_iterations: of the conjugate gradient, from 1 to 2³¹ − 1; None: as many as there are degrees of freedom, and
             1000 at least.
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than

@@ -184,18 +184,18 @@ class Stepper:
 
     def _advance(self, steps: int) -> int:
         """Makes steps until one fails, and counts those that were made."""
-        status = self.arrays["status"].numpy() if self.model.device.is_cpu else np.zeros(1)
-        first = int(self.arrays["counters"].numpy()[0])
+        status = self.arrays.values_of("status") if self.model.device.is_cpu else np.zeros(1)
+        first = int(self.arrays.values_of("counters")[0])
         for _ in range(steps):
             self.integrator.advance()
             if status[0]:  # on the CPU the array itself; elsewhere looking would wait for every step
                 break
-        status = self.arrays["status"].numpy()
+        status = self.arrays.values_of("status")
         return int(status[2]) - 1 - first if status[0] else steps
 
     def _status(self) -> int:
         """Reads what went wrong, or 0."""
-        return int(self.arrays["status"].numpy()[0])
+        return int(self.arrays.values_of("status")[0])
 
     def make_room(self) -> None:
         """Makes room for more nodes near each, and captures anew: what was captured has the arrays of before."""
