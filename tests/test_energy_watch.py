@@ -103,7 +103,7 @@ def test_a_run_that_gains_ends_with_an_error_that_says_so():
     # without the watch it goes on, to several times its energy
     unwatched = wy.Simulator(simulator.scene, integrator="implicit-midpoint", step=1e-3, energy_watch=False)
     unwatched.state = error.trajectory[0]
-    energy = energies(unwatched, unwatched.run(40))
+    energy = energies(unwatched, unwatched.run(80))
     assert energy.max() > 1.5 * energy[0]
 
 

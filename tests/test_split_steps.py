@@ -55,9 +55,10 @@ def check_directional_derivatives(
                 ]
             return (ends[0] - ends[1]) / (2.0 * h)
 
-        h = 3e-6
+        # Newton's iteration leaves numbers near 1 some 1e-11 uncertain, one linear solve a stage 1e-12, and there the
+        # loss is more curved: up to 1.2e-6 is seen
+        h = 3e-6 if rollout.simulator.integrator.name in ("linear", "ros2") else 1e-5
         expected = (4.0 * difference(h) - difference(2.0 * h)) / 3.0
-        # differences of numbers near 1 that solves leave some 1e-12 uncertain, over 3e-6: up to 1.2e-6 is seen
         assert found == pytest.approx(expected, rel=1e-5, abs=2e-6), name
 
 

@@ -195,3 +195,8 @@ def contact_normals(cloth: Cloth | Cloths, position: np.ndarray) -> np.ndarray:
         for frame in range(len(position)):
             wp.launch(kernel, dim=dim, inputs=[*_CROSSINGS[cloth], positions[frame], normals[frame]], device=device)
         return normals.numpy()
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scales to length 1. Where a yarn has shrunk to a point it has no direction; 0 there keeps its tube finite."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)

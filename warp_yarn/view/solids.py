@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..description.obstacles import TriangleMesh
-from .geometry import Placed
-from .yarns import unit
+from .geometry import Placed, unit
 
 ROUND = 96
 """Facets around what is round."""

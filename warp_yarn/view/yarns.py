@@ -17,7 +17,7 @@ import numpy as np
 from ..description.cloth import Cloth
 from ..description.cloths import Cloths
 from .free_ends import clear, rested, trims
-from .geometry import PALETTE, contact_normals
+from .geometry import PALETTE, contact_normals, unit
 
 FREE_END = 0.4
 """How far a free end sticks out of the yarn that it crosses last, in spacings."""
@@ -385,11 +385,6 @@ def squeezed(
         distance = np.sqrt((x**2 + z**2).min(axis=1))
         room = np.where(crossed[:, 0] > 0.0, np.minimum(room, distance), room)
     return np.maximum(room, LEAST_HEIGHT * half)[inverse.ravel()]
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Scales to length 1. Where a yarn has shrunk to a point it has no direction; 0 there keeps its tube finite."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
 
 
 def _smooth(share: np.ndarray) -> np.ndarray:
