@@ -28,6 +28,8 @@ ACCELERATION = 200.0
 """Twenty times gravity [m/s²]: in cm/s² it is 980."""
 SPEED = 350.0
 """Of wind [m/s], beyond sound: 10 m/s are 1000 cm/s."""
+GRAVITY = 9.8
+"""By which weights are told that forces are compared with [m/s²]."""
 STEP = 0.2
 """Of time [s]: films have 24 frames a second; longer steps look for equilibrium."""
 ROUNDED = 20.0
@@ -83,7 +85,7 @@ def warn_of_rounding(cloth: Woven) -> None:
     # a coordinate of the cloth, counted from its middle, is rounded by half of the last place
     off = 0.5 * float(np.finfo(np.float32).eps) * 0.5 * float(np.ptp(cloth.position, axis=0).max())
     pull = float((stretch / cloth.segment_spacing).max()) * off
-    weight = 9.8 * cloth.mass / topology.nodes
+    weight = GRAVITY * cloth.mass / topology.nodes
     if pull > ROUNDED * weight:
         warnings.warn(
             f"precision = 'single' rounds the pull of a yarn by {pull:.2g} N, {pull / weight:.2g} times the weight of "

@@ -72,13 +72,11 @@ def needs_strips(scene: Scene, step: float) -> bool:
         scene: the scene.
         step: h [s].
     """
-    cloth = scene.cloth
-    yarn = cloth.topology.segment_yarn if cloth.general else slice(None)
-    material = cloth.material[yarn] if cloth.general else slice(None)
-    spacing = cloth.segment_spacing if cloth.general else cloth.spacing
-    section = cloth.stretch_stiffness / [each.stretch for each in cloth.yarns]
-    bend = section * [each.bend for each in cloth.yarns]
-    softness = (BENT * bend / cloth.stretch_stiffness)[material] / spacing**2 + 1.0 / (stretch_rate(scene) * step) ** 2
+    material, spacing = _segments(scene)
+    bend, stretch = np.array([(yarn.bend, yarn.stretch) for yarn in scene.cloth.yarns]).T
+    # yarns that do not resist stretching have no bound of it
+    with np.errstate(divide="ignore", invalid="ignore"):
+        softness = (BENT * bend / stretch)[material] / spacing**2 + 1.0 / (stretch_rate(scene) * step) ** 2
     return bool(softness.min() < INEXTENSIBLE)
 
 
@@ -105,8 +103,13 @@ def newton_tolerance(scene: Scene, precision: str, step: float) -> float:
 
 def stretch_rate(scene: Scene) -> np.ndarray:
     """Compute √(k_s/(m L)) of every material, in a general cloth of every segment, m the mass of a segment [1/s]."""
+    material, spacing = _segments(scene)
+    return np.sqrt(scene.cloth.stretch_stiffness / [yarn.density for yarn in scene.cloth.yarns])[material] / spacing
+
+
+def _segments(scene: Scene) -> tuple[np.ndarray | slice, np.ndarray | float]:
+    """Find the material and the distance [m] of every segment of a general cloth, else all materials and the one."""
     cloth = scene.cloth
-    speed = np.sqrt(cloth.stretch_stiffness / [yarn.density for yarn in cloth.yarns])
     if cloth.general:
-        return speed[cloth.material[cloth.topology.segment_yarn]] / cloth.segment_spacing
-    return speed / cloth.spacing
+        return cloth.material[cloth.topology.segment_yarn], cloth.segment_spacing
+    return slice(None), cloth.spacing

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -53,13 +54,13 @@ class Curves(Shape):
             self.prim.CreateWidthsAttr(_floats(np.repeat(widths, strands.counts + 2)))
             self.prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
         self.margin = 0.5 * float(widths.max())
-        self._repeated = strands.repeated
-        self._places, self._height = strands.places[self._repeated], strands.height[self._repeated, None]
-        self._arc = _primvars(self.prim, strands, strands.arc[self._repeated], strands.yarn)
+        self._repeated = repeated = strands.repeated
+        # gathered once, and not from the points of every frame
+        self._drawn = dataclasses.replace(strands, places=strands.places[repeated], height=strands.height[repeated])
+        self._arc = _primvars(self.prim, strands, strands.arc[repeated], strands.yarn)
 
     def points(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        # as of the strands, but gathered once
-        return places.take(self._places, axis=0) + self._height * normals.take(self._places, axis=0)
+        return self._drawn.points(places, normals)
 
     def slide(self, euler: np.ndarray, time: float | None) -> None:
         if time is not None:

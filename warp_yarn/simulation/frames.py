@@ -108,9 +108,14 @@ class Frames:
         """Copies the first frames of the chunk on the device to where they belong."""
         for name in FIELDS:
             if self.moves(name):
-                kept = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
-                origin = self.arrays.origin if name == "position" else 0.0
+                kept, origin = self._of_chunk(name)
                 getattr(trajectory, name)[at : at + count] = kept[:count] + origin
+
+    def _of_chunk(self, name: str) -> tuple[np.ndarray, np.ndarray | float]:
+        """Gives what the frames of the chunk on the device have of the state [frames, nodes, ...], and the place that
+        it is counted from."""
+        kept = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
+        return kept, self.arrays.origin if name == "position" else 0.0
 
     def room(self, frames: int, start: int) -> Trajectory:
         """Makes a trajectory that holds the present state in its first frame, and in all of what does not change."""
@@ -130,8 +135,7 @@ class Frames:
         ends = [self.state(), self.state()]
         for name in FIELDS:
             if self.moves(name):
-                kept = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
-                origin = self.arrays.origin if name == "position" else 0.0
+                kept, origin = self._of_chunk(name)
                 setattr(ends[0], name, kept[self.filled - 1].astype(np.float64) + origin)
         return ends
 
@@ -170,8 +174,7 @@ class Frames:
         after, share = np.ceil(places).astype(int), (places - before)[:, None, None]
         for name in FIELDS:
             if self.moves(name) and len(places):
-                made = self.arrays.values_of(f"frame_{name}").reshape(self.chunk + 1, self.scene.cloth.nodes, -1)
-                origin = self.arrays.origin if name == "position" else 0.0
+                made, origin = self._of_chunk(name)
                 # what stands still does so to the last bit
                 kept = made[before] + share * (made[after] - made[before])
                 getattr(trajectory, name)[at : at + len(places)] = kept + origin

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..description.sanity import GRAVITY
 from ..device.declarations import FRAMES
 from ..device.energy_watch import MEMORY
 from ..device.model import Model
@@ -32,8 +33,6 @@ and of either at all. Of steps as they were made, with Newton's default toleranc
 ordinary motion but for 5 % where pins stop at once, and 57 % of what pins give from states that no step resolves. Of
 steps in parts that are taken for one, or of another method, it was 2 % where yarns are soft, and all where they are
 stiff."""
-GRAVITY = 9.8
-"""[m/s²]"""
 EPSILON = {"double": 1e-15, "single": 1e-7}
 """Of positions: their rounding, with room in double precision."""
 

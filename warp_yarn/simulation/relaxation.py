@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..description.sanity import GRAVITY
 from ..device.exclusive import ALONE
 from ..device.model import Model
 from ..errors import InputError, SimulationError, integer, real
@@ -199,7 +200,7 @@ class Relaxation:
 def _default(model: Model) -> float:
     """Gives the force to end with: a part of a node's weight, but what rounding of positions leaves at least."""
     rounding = rounding_force(model)
-    weight = 9.8 * model.arrays.node_mass()
+    weight = GRAVITY * model.arrays.node_mass()
     if rounding > ROUGH * weight:
         raise InputError(
             f"residual = None, must be given here: positions in {model.precision} precision leave forces of some "
