@@ -1,7 +1,9 @@
 """Newton's iteration on an implicit stage (``stepping/dirk.py``): its start, its control and when to take a new matrix.
 
-It takes A, the symmetric positive definite part of −∂r/∂w, for its matrix: M + η D + η² H. Where that brings it on
-slowly, and yarns are compressed, it takes A − G (``linear/beside.py``), as long as that is positive definite.
+It takes A, the symmetric positive definite part of −∂r/∂w, for its matrix: M + η D + η² H. After its first step it takes
+A − G where yarns are compressed (``linear/beside.py``), as long as that is positive definite, each time at the state
+that it has come to. (Only where it went on slowly, with the first matrix until then, took a fifth more iterations of
+handkerchiefs and cotton, and a tenth more time; A − G from the first step on is often indefinite.)
 """
 
 import functools
@@ -24,13 +26,6 @@ SHORTEST_STEP_LENGTH = 2.0**-24
 be short indeed."""
 OVERSHOOT = 0.9
 """Part of the slope that a step of the iteration may turn to with the other sign (``integrators/stage.py``)."""
-SLOW_DECREASE = 0.3
-"""Part of a residual that a step leaves, above which the next evaluation brings a new matrix along: at 0.1, more
-matrices cost more than the iterations that they saved (17 × 17, steps of 2 ms)."""
-COMPRESSION_DECREASE = 0.1
-"""The same, above which the next direction is one of A − G, which sees that yarns are compressed. Hung cloth that is
-buckled then takes 5.8 iterations where it took 9.1, and impacts two thirds; where no yarn is compressed it costs
-nothing, and where A − G is indefinite a solve that is begun twice (0 to 2 % of a step of cotton)."""
 CONTRACTION_SAFETY = 4.0
 """What a step of the iteration leaves is taken to be so many times what the contraction before it says."""
 STEADY_CONTRACTION = 0.97
@@ -212,10 +207,8 @@ def define(variant: Variant) -> SimpleNamespace:
             ordered = control.shortest[0] > scalar(0.0)
             control.shortest[0] = scalar(wp.static(1.0e30))
         if first or (ordered and (now < before or turned > scalar(-OVERSHOOT) * control.directional_derivative[0])):
-            if not first and now > scalar(SLOW_DECREASE) * before:
-                # a step that hardly helps: the matrix is of another state
+            if not first:
                 control.rebuild_matrix[0] = 1
-            if not first and now > scalar(COMPRESSION_DECREASE) * before:
                 control.asks_for_compression[0] = 1
             if now == scalar(0.0) or (not first and now > scalar(0.5) * before and now <= rounding):
                 # what no longer falls, and is less than positions can tell, is rounding

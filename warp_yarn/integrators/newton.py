@@ -51,9 +51,8 @@ class Newton:
         self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
 
     def solve(self, stage: int) -> None:
-        """Solves a stage. Its matrix is that of its start until convergence is slow: another state's differs less
-        from it than it differs from the exact derivative. A second stage does with the first's where yarns hardly
-        turn."""
+        """Solves a stage. Its first two steps have the matrix of its start, and a second stage that of the first where
+        one step was enough there and yarns hardly turn."""
         a = self.model.arrays
         a.zero("evaluations", "steps", "direction", "euler_direction", "asks_for_compression")
         self.compression.forget()
@@ -106,7 +105,7 @@ class Newton:
         self._control()
 
     def solve_direction(self, stage: int) -> None:
-        """Solves for δ, from A δ = r, or from (A − G) δ = r where convergence was slow."""
+        """Solves for δ, from A δ = r, or from (A − G) δ = r after the first."""
         a = self.model.arrays
         self.model.copy(solution_before="solution", euler_solution_before="euler_solution")
         wp.capture_if(a["asks_for_compression"], on_true=self.compression.find)
