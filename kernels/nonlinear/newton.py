@@ -1,9 +1,9 @@
 """Newton's iteration on an implicit stage (``stepping/dirk.py``): its start, its control and when to take a new matrix.
 
-It takes A, the symmetric positive definite part of −∂r/∂w, for its matrix: M + η D + η² H. After its first step it takes
-A − G where yarns are compressed (``linear/beside.py``), as long as that is positive definite, each time at the state
-that it has come to. (Only where it went on slowly, with the first matrix until then, took a fifth more iterations of
-handkerchiefs and cotton, and a tenth more time; A − G from the first step on is often indefinite.)
+It takes A, the symmetric positive definite part of −∂r/∂w, for its matrix: M + η D + η² H. After its first step it
+takes A − G where yarns are compressed (``linear/beside.py``), as long as that is positive definite, each time at the
+state that it has come to. (Only where it went on slowly, and with the first matrix until then, handkerchiefs and cotton
+took a fifth more iterations and a tenth more time; from the first step on, A − G is often indefinite.)
 """
 
 import functools
