@@ -21,7 +21,7 @@ from .linear import (
     strips,
 )
 from .nonlinear import line_search, newton
-from .stepping import dirk, energy_watch, frames, linear, linear_adjoint, ros2, stage_adjoint
+from .stepping import dirk, energy_watch, esdirk, esdirk_adjoint, frames, linear, linear_adjoint, ros2, stage_adjoint
 from .terms import (
     applied_force,
     bending,
@@ -156,6 +156,8 @@ def _build(variant: Variant) -> dict[str, wp.Kernel]:
         frames,
         linear_adjoint,
         stage_adjoint,
+        esdirk,
+        esdirk_adjoint,
         ros2,
     ):
         kernels |= vars(part.define(variant.forward))

@@ -108,13 +108,14 @@ def define(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def add_work(
-        share: scalar,
+        stage: int,
+        stage_shares: wp.array(dtype=scalar),
         step_size: wp.array(dtype=scalar),
         power: wp.array(dtype=scalar),
         stage_work: wp.array(dtype=scalar),
     ):
         """Add up the work of a stage's power, which makes its share of the step."""
-        stage_work[0] += share * step_size[0] * power[0]
+        stage_work[0] += stage_shares[stage] * step_size[0] * power[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def suspect(

@@ -26,8 +26,10 @@ from .fields import Field, conditions
 
 YARN_PARAMETERS = ("density", "stretch", "bend")
 
-STATE_TYPES = {name: 3 if field.kind == "vec3" else field.count for name, field in declarations.STATE.items()}
-"""Numbers a node has in each array of the state."""
+MOVING = {name: 3 if field.kind == "vec3" else field.count for name, field in declarations.MOVING.items()}
+"""Numbers a node has in each array that a step changes: the state, and slopes that some methods leave to the next."""
+STATE_TYPES = {name: MOVING[name] for name in declarations.STATE}
+"""The same of the state."""
 
 
 class Arrays(DeclaredArrays):

@@ -10,6 +10,7 @@ import dataclasses
 
 from ..description.strips import SOURCES
 from ..kernels.linear.block_tridiagonal import factor_size
+from ..kernels.stepping.esdirk import COEFFICIENTS
 from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
 from .fields import Field, Group
 
@@ -91,7 +92,7 @@ STEP: Group = {
     "counters": Field("world", 2, "int", "", "always", "the present frame of the chunk, and the present step"),
     "step_size": Field("world", 1, "scalar", "s", "always", "h"),
     "remaining": Field("world", 1, "scalar", "s", "always", "time in which hard pins reach their targets"),
-    "stage_times": Field("world", 4, "scalar", "steps", "always", "of two stages, of the step's end and of its start"),
+    "stage_times": Field("world", 5, "scalar", "steps", "always", "of three stages, of the step's end and its start"),
     "coefficients": Field("world", 1, "vec3", "1, s, s²", "always", "what M, D and H are multiplied by in the matrix"),
 }
 """What steers a step."""
@@ -215,6 +216,7 @@ NEWTON_WORKSPACE: Group = {
     "carried_time": Field("world", 1, "scalar", "s", "always", "t by which a stage's velocity carries on"),
     "carried_rate": Field("world", 1, "scalar", "", "always", "k by which its gain of velocity carries on"),
     "unit": Field("world", 1, "scalar", "", "always", "1"),
+    "stage_shares": Field("world", 4, "scalar", "", "always", "of three stages in a step, and of its start"),
     "newton_tolerance": Field("world", 1, "scalar", "", "always", "of what is left of the velocities to find"),
     "inner_tolerance": Field("world", 1, "scalar", "", "always", "of the linear solves in an iteration"),
     "residual_norm": Field("world", 1, "scalar", "√J", "always", "‖r‖, and ‖ρ‖ of an adjoint solve"),
@@ -237,6 +239,25 @@ NEWTON_WORKSPACE: Group = {
     "order_would_be_lost": Field("world", 1, "int", "", "always", "whether crossings would pass at the start"),
 }
 """Of implicit stages and Newton's iteration."""
+
+SLOPES: Group = {
+    "slope": Field("node", 1, "vec3", "m/s²", "slopes", "of the last stage of the step before; NaN: not known"),
+    "euler_slope": Field("node", 2, "scalar", "m/s²", "slopes of sliding", "the same of (u, v)"),
+}
+"""What a step leaves to the next beside the state, by methods whose first stage is explicit."""
+
+EXPLICIT_STAGE: Group = {
+    "start_position": Field("node", 1, "vec3", "m", "always", "x that the step started from"),
+    "start_euler": Field("node", 2, "scalar", "m", "always", "(u, v)"),
+    "start_velocity": Field("node", 1, "vec3", "m/s", "always", "ẋ"),
+    "start_euler_velocity": Field("node", 2, "scalar", "m/s", "sliding", "(u̇, v̇)"),
+    "second_solution": Field("node", 1, "vec3", "m/s", "always", "w₂"),
+    "euler_second_solution": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
+    "tableau": Field("world", COEFFICIENTS, "scalar", "", "always", "its coefficients"),
+    "asks_for_slope": Field("world", 1, "int", "", "always", "whether the slope is not known"),
+    "stage_settings": Field("world", 4, "scalar", "s, 1", "always", "η, that of a short stage, and their tolerances"),
+}
+"""Of methods whose first stage is explicit (``kernels/stepping/esdirk.py``)."""
 
 COMPRESSION: Group = {
     "compressed": Field("world", 1, "int", "", "Newton's iteration", "whether solves are of A − G"),
@@ -275,11 +296,14 @@ OUTER_FORCES: Group = {
 }
 """Of that watch, where wind or applied forces do work."""
 
-FRAMES: Group = {f"frame_{name}": dataclasses.replace(field, element="frame node") for name, field in STATE.items()}
+MOVING: Group = {**STATE, **SLOPES}
+"""What a step changes."""
+
+FRAMES: Group = {f"frame_{name}": dataclasses.replace(field, element="frame node") for name, field in MOVING.items()}
 FRAMES["frame_euler"] = dataclasses.replace(FRAMES["frame_euler"], when="sliding")
 """Of what moves, a chunk of frames."""
 
-KEPT: Group = {f"kept_{name}": field for name, field in (*STATE.items(), ("bounds", ENERGY_WATCH["bounds"]))}
+KEPT: Group = {f"kept_{name}": field for name, field in (*MOVING.items(), ("bounds", ENERGY_WATCH["bounds"]))}
 """The beginning of a part of a step, which may have to be made again."""
 
 LOSS: Group = {f"loss_{name}": dataclasses.replace(field, element="frame node") for name, field in STATE.items()}
@@ -299,6 +323,14 @@ CARRIED_ADJOINT: Group = {
 }
 """Of the adjoint of methods with stages."""
 
+EXPLICIT_ADJOINT: Group = {
+    "first_base": Field("node", 1, "vec3", "m/s", "always", "v₁ that the first implicit stage starts from"),
+    "euler_first_base": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
+    "second_base": Field("node", 1, "vec3", "m/s", "always", "v₂ of the second"),
+    "euler_second_base": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
+}
+"""Of the adjoint of methods whose first stage is explicit: only their gradients are used."""
+
 STAGE_ADJOINT: Group = {
     "zero": Field("node", 1, "vec3", "", "always", "0 in place of w̄"),
     "euler_zero": Field("node", 2, "scalar", "", "sliding", "the same of (u, v)"),
@@ -312,13 +344,13 @@ LAUNCH: Group = {
     "add_contact_load": Field("launch", 1, "int", "", "always", "whether a term is to add to ``contact_load``"),
     "stage": Field("launch", 1, "int", "", "always", "which stage of the step, from 0"),
     "along": Field("launch", 1, "int", "", "always", "direction of lines: 0 warp, 1 weft"),
+    "which": Field("launch", 1, "int", "", "always", "1 of the stage that a slope is found by, else 0"),
     "first": Field("launch", 1, "int", "", "always", "first node of a level"),
     "count": Field("launch", 1, "int", "", "always", "nodes of a level"),
     "thread": Field("launch", 1, "int", "", "always", "which thread of a shared solve, from 0"),
     "most_iterations": Field("launch", 1, "int", "", "always", "of a linear solve"),
     "by": Field("launch", 1, "int", "", "always", "steps to count, 1 or -1"),
     "by_stages": Field("launch", 1, "int", "", "always", "whether ``stage_work`` was added up"),
-    "share": Field("launch", 1, "scalar", "", "always", "of a stage in what a step makes"),
     "step_duration": Field("launch", 1, "scalar", "s", "always", "h of a whole step"),
     "is_last": Field("launch", 1, "int", "", "always", "whether what is in the way is a failure"),
     "moves": Field("launch", 1, "int", "", "always", "whether to look at where a step would lead"),
@@ -355,6 +387,8 @@ GROUPS: dict[str, Group] = {
     "Stages": STAGES,
     "FirstStage": FIRST_STAGE,
     "NewtonWorkspace": NEWTON_WORKSPACE,
+    "Slopes": SLOPES,
+    "ExplicitStage": EXPLICIT_STAGE,
     "Compression": COMPRESSION,
     "ErrorEstimate": ERROR_ESTIMATE,
     "EnergyWatch": ENERGY_WATCH,
@@ -364,6 +398,7 @@ GROUPS: dict[str, Group] = {
     "Loss": LOSS,
     "Adjoint": ADJOINT,
     "CarriedAdjoint": CARRIED_ADJOINT,
+    "ExplicitAdjoint": EXPLICIT_ADJOINT,
     "StageAdjoint": STAGE_ADJOINT,
     "Launch": LAUNCH,
 }

@@ -20,8 +20,8 @@ MEMORY = ("bounds", "steps_to_audit", "audit_due", "alert", "outer_force")
 LOOKED_AT = ("elastic_energy", "height_energy")
 SAME = {wp.float64: 1e-9, wp.float32: 1e-4}
 """Part of energies that rounding, also of where pins are, makes of the same ones."""
-AT_END, AT_START = 2, 3
-"""The places of a step's end and start among ``stage_times``, behind those of two stages."""
+AT_END, AT_START = 3, 4
+"""The places of a step's end and start among ``stage_times``, behind those of three stages."""
 
 
 class EnergyWatch:
@@ -115,11 +115,11 @@ class EnergyWatch:
         """Begins to add up the work done in a step."""
         self.model.arrays.zero("stage_work")
 
-    def add_work(self, share: float) -> None:
-        """Adds the work that is done at the present state in a share of the step."""
+    def add_work(self, stage: int) -> None:
+        """Adds the work that is done at the present state in the share of a stage; 3: of one at the step's start."""
         if self.on:
             self._add_powers()
-            self.model.launch("add_work", 1, share=share)
+            self.model.launch("add_work", 1, stage=stage)
 
     @property
     def _outer(self) -> list[Term]:

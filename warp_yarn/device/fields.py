@@ -56,6 +56,8 @@ def known_conditions(scene: Scene, variant: Variant, terms: list[Term]) -> dict[
         "always": True,
         # what a method adds, and not the scene
         "Newton's iteration": False,
+        "slopes": False,
+        "slopes of sliding": False,
         "sliding": variant.sliding,
         "general": variant.general,
         "contact": any(term.needs_contact for term in terms),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from ..description.levels import BLOCKS
@@ -20,7 +21,7 @@ from ..kernels.core.general import NUMBERS
 from . import defaults, start
 from .arrays import Arrays
 from .contact import Contact
-from .declarations import INPUTS
+from .declarations import INPUTS, SLOPES
 from .declared import arguments
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
@@ -120,7 +121,7 @@ class Model:
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
         reached = [1.0 if self.has_hard_pins else begun + time * step / self.step_size for time in (*times, 1.0)]
-        a.put("stage_times", *reached, *[reached[-1]] * (3 - len(reached)), begun)
+        a.put("stage_times", *reached, *[reached[-1]] * (4 - len(reached)), begun)
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("coefficients", 1.0, stage, stage * stage)
@@ -175,6 +176,19 @@ class Model:
         if self.arrays.contact:
             _find_crossings(self)
         self.contact.find(matrix=matrix)
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """Copies what steps left to those that come, beside the state."""
+        slopes = [name for name in SLOPES if self.arrays.get(name) is not None]
+        return self.energy.memory() | {name: self.arrays.values_of(name).copy() for name in slopes}
+
+    def go_on(self, memory: dict[str, np.ndarray], steps_done: int) -> None:
+        """Goes on from the present state by what another one's ``memory`` gave there after so many steps."""
+        self.energy.go_on(memory, steps_done)
+        for name in SLOPES:
+            array = self.arrays.get(name)
+            if array is not None and name in memory and memory[name].shape == array.numpy().shape:
+                array.assign(memory[name].astype(array.numpy().dtype))
 
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
@@ -237,7 +251,13 @@ class Model:
         self.energy.end_step(by_stages=by_stages)
         self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
+        self.record()
+
+    def record(self) -> None:
+        """Records the present state as the present frame."""
         self.launch("record", "nodes")
+        if "slopes" in self.arrays.conditions:
+            self.launch("record_slope", "nodes")
 
 
 def _find_crossings(model: Model) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..device import declarations
-from ..device.arrays import STATE_TYPES
+from ..device.arrays import MOVING, STATE_TYPES
 from ..device.contact import OBSTACLE_PATHS, PLACED
 from ..device.declared import arrays_of
 from ..device.inputs import PATHS
@@ -40,7 +40,8 @@ class Adjoint:
         self.simulator, self.parameters = simulator, parameters
         a = self.arrays = simulator.arrays
         self.moving = [name for name in PATHS if name in parameters and f"{name}_path" in a]
-        self.wanted = (*STATE_TYPES, *parameters, *(f"{name}_path" for name in self.moving))
+        slopes = [name for name in MOVING if name not in STATE_TYPES and name in a]
+        self.wanted = (*STATE_TYPES, *slopes, *parameters, *(f"{name}_path" for name in self.moving))
         a.require_grad(*self.wanted)
         self.places = any(name in parameters for name in OBSTACLE_PATHS)
         if self.places:
@@ -71,7 +72,7 @@ class Adjoint:
     def release(self) -> None:
         """Gives the gradients of parameters up, before another one asks for other parameters."""
         for name in self.wanted:
-            if name not in STATE_TYPES and self.arrays[name] is not None:
+            if name not in MOVING and self.arrays[name] is not None:
                 self.arrays[name].requires_grad = False
 
     def clear(self) -> None:

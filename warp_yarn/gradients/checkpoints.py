@@ -12,10 +12,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..device.arrays import STATE_TYPES
+from ..device.arrays import MOVING
 from ..errors import GradientError
 from ..simulation.simulator import Simulator
-from ..simulation.state import FIELDS
 
 
 class Checkpoints:
@@ -40,8 +39,8 @@ class Checkpoints:
         device, nodes = wp.device_to_torch(simulator.model.device), simulator.scene.cloth.nodes
         frames = self.count if count is None else count
         return {
-            name: torch.empty((frames, nodes, STATE_TYPES[name]), dtype=self.dtype, device=device)
-            for name in FIELDS
+            name: torch.empty((frames, nodes, width), dtype=self.dtype, device=device)
+            for name, width in MOVING.items()
             if simulator.moves(name)
         }
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
+from ..device.arrays import MOVING
 from ..device.exclusive import ALONE
 from ..simulation.simulator import Simulator
-from ..simulation.state import FIELDS
 from .checkpoints import flat
 
 
@@ -86,7 +86,7 @@ class PartsRecorder:
         """Takes down a part that was made, whose end is the present state."""
         with ALONE:
             arrays = self.simulator.arrays
-            moving = [name for name in FIELDS if self.simulator.moves(name)]
+            moving = [name for name in MOVING if self.simulator.moves(name)]
             start, end = ({name: flat(arrays[of + name]).clone() for name in moving} for of in ("kept_", ""))
             step = int(arrays["counters"].numpy()[1]) - self.steps_done
             zones = self.simulator.model.zones

@@ -7,6 +7,7 @@ what they leave).
 
 from typing import Any
 
+from .esdirk3 import ESDIRK3
 from .implicit_euler import ImplicitEuler
 from .implicit_midpoint import ImplicitMidpoint
 from .linear import LinearlyImplicitEuler
@@ -14,6 +15,6 @@ from .ros2 import ROS2
 from .sdirk2 import SDIRK2
 
 INTEGRATORS: dict[str, Any] = {
-    method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, ImplicitMidpoint, SDIRK2, ROS2)
+    method.name: method for method in (LinearlyImplicitEuler, ImplicitEuler, ImplicitMidpoint, SDIRK2, ROS2, ESDIRK3)
 }
 """Every method by its name."""

@@ -44,6 +44,7 @@ class StageMethod:
         a.put("stage_size", stage)
         a.put("carried_time", self.carried * step)
         a.put("carried_rate", self.carried / self.fraction)
+        a.put("stage_shares", *self._shares, *[0.0] * (4 - self.stages))
 
     def advance(self) -> None:
         """Makes a step, and records it: one captured graph, whose loops end on the device."""
@@ -62,7 +63,7 @@ class StageMethod:
                     model.copy(predicted="solution")
             self.newton.solve(stage)
             self.newton.refuse_impact()
-            model.energy.add_work(self._shares[stage])
+            model.energy.add_work(stage)
         if estimates:
             model.launch("estimate_error", 1)
         if self.is_carried:
@@ -73,7 +74,13 @@ class StageMethod:
                 velocity="base_velocity",
                 euler_velocity="base_euler_velocity",
             )
-        model.end_step(by_stages=True)
+        self._end()
+
+    def _end(self) -> None:
+        """Ends a step, with what the next one asks of it."""
+        if "slopes" in self.model.arrays.conditions:
+            self.model.launch("keep_slope", "nodes")
+        self.model.end_step(by_stages=True)
 
     @property
     def _shares(self) -> tuple[float, ...]:
@@ -102,13 +109,17 @@ class StageMethod:
         """Starts from the present state, at the present velocity."""
         model = self.model
         model.begin_step()
-        model.energy.begin_work()
+        self._begin_work()
         model.inputs.load()
         model.arrays.zero("newton_iterations", "node_mass")
         model.launch("lump_mass", "segments")
         model.copy(solution="velocity", euler_solution="euler_velocity")
         model.set_pin_velocity()
         self.set_base()
+
+    def _begin_work(self) -> None:
+        """Begins to add up the work that is done in a step."""
+        self.model.energy.begin_work()
 
     def set_base(self) -> None:
         self.model.copy(

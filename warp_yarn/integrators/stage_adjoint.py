@@ -42,6 +42,8 @@ class StageAdjoint:
         a.put("adjoint_tolerance", tolerance)
         base = ("base_position", "base_euler", "base_velocity", "base_euler_velocity")
         a.require_grad(*BETWEEN, *MOVED, *base, "rhs", "euler_rhs", "solution", "euler_next", "anchor_next")
+        if "slopes" in a.conditions:
+            a.require_grad("slope", "euler_slope")
         if model.scene.sliding:
             a["euler_next"].grad = a["base_euler"].grad
         self.tape, self.anchor_tape, self.pin_tape = wp.Tape(), wp.Tape(), wp.Tape()
@@ -98,6 +100,8 @@ class StageAdjoint:
             model.launch("carry_adjoint", "nodes", time=a["carried_time"], rate=a["carried_rate"])
         else:
             model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
+        if "slopes" in a.conditions:
+            model.launch("slope_adjoint", "nodes")
 
     def _enter_first(self) -> None:
         """Enters the stage before it, and w̄ of what it carried to the next."""

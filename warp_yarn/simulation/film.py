@@ -172,7 +172,7 @@ class Filming:
         if end is not None:
             simulator.substepping.next_size = end.next_size
             with ALONE:
-                simulator.stepper.model.energy.go_on(end.watched, end.steps_done)
+                simulator.stepper.model.go_on(end.watched, end.steps_done)
         return simulator
 
     @property
@@ -200,7 +200,7 @@ class Filming:
     @alone
     def _end(self) -> End:
         """Gives what a run goes on from that ends here."""
-        return End(self.state, self.steps_done, self.substepping.next_size, self.stepper.model.energy.memory())
+        return End(self.state, self.steps_done, self.substepping.next_size, self.stepper.model.memory())
 
 
 class Walk:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ..device.arrays import STATE_TYPES
+from ..device.arrays import MOVING, STATE_TYPES
+from ..device.declarations import SLOPES
 from ..device.exclusive import ALONE
 from ..device.model import Model
 from ..errors import InputError
@@ -64,7 +66,7 @@ class Frames:
 
     def moves(self, name: str) -> bool:
         """Tells whether this part of the state changes in the scene."""
-        return self.arrays[name] is not None and (name != "euler" or self.scene.sliding)
+        return self.arrays.get(name) is not None and (name != "euler" or self.scene.sliding)
 
     def rest(self) -> State:
         """Makes the state of a cloth at rest; it shares the cloth's arrays."""
@@ -95,11 +97,15 @@ class Frames:
                 if name == "position":
                     value = value - self.arrays.origin
                 array.assign(value if array.dtype == self.arrays.variant.vec3 else value.ravel())
+        # no step has left them
+        for name in SLOPES:
+            if self.moves(name):
+                self.arrays[name].fill_(math.nan)
 
     def restore(self, frame: int) -> None:
         """Puts the state of a frame of the chunk in place."""
         with ALONE:
-            for name in FIELDS:
+            for name in MOVING:
                 if self.moves(name):
                     count = self.arrays[name].shape[0]
                     wp.copy(self.arrays[name], self.arrays[f"frame_{name}"], src_offset=frame * count, count=count)
@@ -193,5 +199,5 @@ class Frames:
         filled, _ = recording.kept
         frames = recording.trajectory.cut(filled)
         if filled:
-            frames.end = End(self.state(), steps_done, next_size, self.model.energy.memory())
+            frames.end = End(self.state(), steps_done, next_size, self.model.memory())
         return frames

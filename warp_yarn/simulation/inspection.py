@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..device.arrays import MOVING
 from ..device.contact import Near
 from ..device.model import Model
 from ..errors import InputError
@@ -16,7 +17,7 @@ from .alone import alone
 from .checks import checked_state
 from .contacts import Contacts, contacts_of
 from .linear_system import LinearSystem, read_system
-from .state import FIELDS, State
+from .state import State
 from .stepper import Stepper
 
 GIVEN = ("gravity", "wind_velocity", "gust", "applied_force", "applied_force_path")
@@ -235,7 +236,7 @@ class Visit:
     def __enter__(self) -> None:
         stepper, model, home = self.stepper, self.stepper.model, {}
         if self.visited is not None:
-            home = {name: model.arrays[name].numpy().copy() for name in FIELDS if stepper.frames.moves(name)}
+            home = {name: model.arrays[name].numpy().copy() for name in MOVING if stepper.frames.moves(name)}
         if model.inputs.functions:
             given = [name for name in GIVEN if model.arrays.get(name) is not None]
             home |= {name: model.arrays[name].numpy().copy() for name in given}
@@ -252,7 +253,7 @@ class Visit:
             model.inputs.evaluate(self.row, stepper.frames.state().position if begun is None else begun)
         if not self.by_stages:
             # before the first step, pins are where they start
-            model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 4)
+            model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 5)
             model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)

@@ -71,7 +71,7 @@ class Steps:
         scene = self.model.scene
         if self.model.zones is not None:
             raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
-        if not hasattr(stepper.integrator, "made"):
+        if getattr(stepper.integrator, "made", None) is None:
             raise InputError(
                 f"integrator = {stepper.integrator.name!r}, whose stages are not known: must be one of the package's, "
                 "or a StageMethod"

@@ -155,7 +155,7 @@ class Simulator(Loads, Filming):
             names = [name for name in (*BESIDE_TERMS, *parameters()) if name in self.arrays]
             values = {name: self.arrays[name].numpy().copy() for name in names}
             steps = (self.steps_done, dict(self.split_steps), set(self.damped_steps))
-            rest = (self.state, *steps, self.substepping.next_size, values, self.model.energy.memory())
+            rest = (self.state, *steps, self.substepping.next_size, values, self.model.memory())
         return _rebuilt, (type(self), self.scene, self._options, *rest)
 
     @alone
@@ -307,7 +307,7 @@ def _rebuilt(
         for name, value in values.items():
             result.arrays[name].assign(value)
         result.stepper.frames.upload(state)
-        result.model.energy.go_on(watched, steps_done)
+        result.model.go_on(watched, steps_done)
     stepper = result.stepper
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size

@@ -159,7 +159,7 @@ class Stepper:
             raise InputError(f"steps = {steps} after {base}, must end at step {LARGEST} at most")
         self.arrays.put("status", 0, 0, 0)
         self._count(0)
-        self._graphs.run("record", lambda: self.model.launch("record", "nodes"))
+        self._graphs.run("record", self.model.record)
         self._chunk = base
         made = 0
         while made < steps:

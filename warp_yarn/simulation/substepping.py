@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ..device.arrays import STATE_TYPES
+from ..device.arrays import MOVING
 from ..device.exclusive import ALONE
 from ..device.graphs import GraphCache
 from ..device.model import Model
@@ -187,7 +187,7 @@ class Substepping:
     def _copy(self, target: str, source: str) -> None:
         """Puts the state by, or brings it back."""
         model, a = self.model, self.model.arrays
-        moving = [name for name in (*STATE_TYPES, "bounds") if a[name] is not None]
+        moving = [name for name in (*MOVING, "bounds") if a.get(name) is not None]
         for name in moving:
             if f"kept_{name}" not in a:
                 with ALONE:

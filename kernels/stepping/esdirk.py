@@ -1,0 +1,196 @@
+"""Methods whose first stage is explicit: its slope is that of the last stage of the step before (``esdirk3.py``).
+
+    q_i = q + h (a_i0 q̇ + Σ_j a_ij w_j),   v_i = q̇ + h (a_i0 q̈ + Σ_j a_ij q̈_j),   q̈_j = (w_j − v_j)/η
+
+are where the implicit stages i = 1, 2, 3 start from, q̈ the slope that the step before left. What is held has one
+velocity in all of a step.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from ..core.indexing import index
+from ..core.variant import Variant
+
+COEFFICIENTS = 6
+"""Of a tableau: a₁₀, a₂₀, a₂₁, b₀, b₁, b₂."""
+
+
+@functools.cache
+def define(variant: Variant) -> SimpleNamespace:
+    scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    module = variant.module("esdirk")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def ask_for_slope(slope: wp.array(dtype=vec3), asks_for_slope: wp.array(dtype=int)):
+        """Look whether the slope is not known."""
+        asks_for_slope[0] = wp.where(wp.isnan(slope[0][0]), 1, 0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def set_stage(
+        which: int,
+        stage_settings: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        newton_tolerance: wp.array(dtype=scalar),
+        coefficients: wp.array(dtype=vec3),
+    ):
+        """Set the size and the tolerance of the stages to come."""
+        eta = stage_settings[which]
+        stage_size[0] = eta
+        newton_tolerance[0] = stage_settings[2 + which]
+        coefficients[0] = vec3(scalar(1.0), eta, eta * eta)
+
+    @wp.func
+    def base(
+        stage: int,
+        h: scalar,
+        eta: scalar,
+        a: wp.array(dtype=scalar),
+        v: vec3,
+        slope: vec3,
+        w1: vec3,
+        w2: vec3,
+    ):
+        """Compute ((q_i − q)/h, v_i, the slope of the stage before) of an implicit stage i, from 0 on."""
+        v_1 = v + slope * (h * a[0])
+        rate = v * a[0]
+        start = v_1
+        last = slope
+        if stage > 0:
+            slope_1 = (w1 - v_1) / eta
+            v_2 = v + (slope * a[1] + slope_1 * a[2]) * h
+            rate = v * a[1] + w1 * a[2]
+            start = v_2
+            last = slope_1
+            if stage > 1:
+                slope_2 = (w2 - v_2) / eta
+                rate = v * a[3] + w1 * a[4] + w2 * a[5]
+                start = v + (slope * a[3] + slope_1 * a[4] + slope_2 * a[5]) * h
+                last = slope_2
+        return rate, start, last
+
+    @wp.kernel(module=module, enable_backward=False)
+    def enter_base(
+        stage: int,
+        step_size: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        tableau: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
+        start_position: wp.array(dtype=vec3),
+        start_velocity: wp.array(dtype=vec3),
+        slope: wp.array(dtype=vec3),
+        first_solution: wp.array(dtype=vec3),
+        second_solution: wp.array(dtype=vec3),
+        solution: wp.array(dtype=vec3),
+        base_position: wp.array(dtype=vec3),
+        base_velocity: wp.array(dtype=vec3),
+        start: wp.array(dtype=vec3),
+    ):
+        """Place what a stage starts from, and w that its iteration starts at, by the slope of the stage before."""
+        i = index(wp.tid())
+        h = step_size[0]
+        if is_free[i] == 0:
+            reached = tableau[0]
+            if stage == 1:
+                reached = tableau[1] + tableau[2]
+            if stage == 2:
+                reached = tableau[3] + tableau[4] + tableau[5]
+            base_position[i] = start_position[i] + solution[i] * (h * reached)
+            base_velocity[i] = solution[i]
+            return
+        rate, v, last = base(
+            stage,
+            h,
+            stage_size[0],
+            tableau,
+            start_velocity[i],
+            slope[i],
+            first_solution[i],
+            second_solution[i],
+        )
+        base_position[i] = start_position[i] + rate * h
+        base_velocity[i] = v
+        if start:
+            start[i] = v + last * stage_size[0]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def enter_euler_base(
+        stage: int,
+        step_size: wp.array(dtype=scalar),
+        stage_size: wp.array(dtype=scalar),
+        tableau: wp.array(dtype=scalar),
+        start_euler: wp.array(dtype=scalar),
+        start_euler_velocity: wp.array(dtype=scalar),
+        euler_slope: wp.array(dtype=scalar),
+        euler_first_solution: wp.array(dtype=scalar),
+        euler_second_solution: wp.array(dtype=scalar),
+        base_euler: wp.array(dtype=scalar),
+        base_euler_velocity: wp.array(dtype=scalar),
+    ):
+        """Place the same of (u, v), of whose rates the iteration starts at those of the stage before."""
+        if wp.static(sliding):
+            i = index(wp.tid())
+            a = 2 * i
+            b = 2 * i + 1
+            zero = scalar(0.0)
+            rate, v, _last = base(
+                stage,
+                step_size[0],
+                stage_size[0],
+                tableau,
+                vec3(start_euler_velocity[a], start_euler_velocity[b], zero),
+                vec3(euler_slope[a], euler_slope[b], zero),
+                vec3(euler_first_solution[a], euler_first_solution[b], zero),
+                vec3(euler_second_solution[a], euler_second_solution[b], zero),
+            )
+            for d in range(2):
+                base_euler[a + d] = start_euler[a + d] + rate[d] * step_size[0]
+                base_euler_velocity[a + d] = v[d]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def keep_slope(
+        stage_size: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
+        solution: wp.array(dtype=vec3),
+        euler_solution: wp.array(dtype=scalar),
+        base_velocity: wp.array(dtype=vec3),
+        base_euler_velocity: wp.array(dtype=scalar),
+        slope: wp.array(dtype=vec3),
+        euler_slope: wp.array(dtype=scalar),
+    ):
+        """Keep the slope of a step's last stage; what is held has none."""
+        i = index(wp.tid())
+        slope[i] = vec3()
+        if is_free[i] != 0:
+            slope[i] = (solution[i] - base_velocity[i]) / stage_size[0]
+        if wp.static(sliding):
+            for s in range(2 * i, 2 * i + 2):
+                euler_slope[s] = (euler_solution[s] - base_euler_velocity[s]) / stage_size[0]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def record_slope(
+        nodes: int,
+        counters: wp.array(dtype=int),
+        slope: wp.array(dtype=vec3),
+        euler_slope: wp.array(dtype=scalar),
+        frame_slope: wp.array(dtype=vec3),
+        frame_euler_slope: wp.array(dtype=scalar),
+    ):
+        """Record it beside the frame."""
+        i = index(wp.tid())
+        k = index(counters[0] * nodes + i)
+        frame_slope[k] = slope[i]
+        if wp.static(sliding):
+            for d in range(2):
+                frame_euler_slope[2 * k + d] = euler_slope[2 * i + d]
+
+    return SimpleNamespace(
+        ask_for_slope=ask_for_slope,
+        set_stage=set_stage,
+        enter_base=enter_base,
+        enter_euler_base=enter_euler_base,
+        keep_slope=keep_slope,
+        record_slope=record_slope,
+    )
