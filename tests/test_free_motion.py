@@ -20,7 +20,7 @@ METHODS = tuple(INTEGRATORS)
 G = 9.8
 DIRECTIONS = ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (2.0 / 3.0, -2.0 / 3.0, 1.0 / 3.0))
 STEPS, STEP = 12, 2e-3
-ORDER = {"linear": 1, "implicit-euler": 1, "sdirk2": 2, "implicit-midpoint": 2, "ros2": 2}
+ORDER = {"linear": 1, "implicit-euler": 1, "sdirk2": 2, "implicit-midpoint": 2, "ros2": 2, "esdirk3": 3}
 norm = np.linalg.norm
 
 

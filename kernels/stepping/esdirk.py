@@ -28,19 +28,10 @@ def define(variant: Variant) -> SimpleNamespace:
         """Look whether the slope is not known."""
         asks_for_slope[0] = wp.where(wp.isnan(slope[0][0]), 1, 0)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def set_stage(
-        which: int,
-        stage_settings: wp.array(dtype=scalar),
-        stage_size: wp.array(dtype=scalar),
-        newton_tolerance: wp.array(dtype=scalar),
-        coefficients: wp.array(dtype=vec3),
-    ):
-        """Set the size and the tolerance of the stages to come."""
-        eta = stage_settings[which]
-        stage_size[0] = eta
-        newton_tolerance[0] = stage_settings[2 + which]
-        coefficients[0] = vec3(scalar(1.0), eta, eta * eta)
+    @wp.func
+    def of_explicit(stage: int, a: wp.array(dtype=scalar)) -> scalar:
+        """Look up a_i0."""
+        return wp.where(stage == 0, a[0], wp.where(stage == 1, a[1], a[3]))
 
     @wp.func
     def base(
@@ -91,27 +82,18 @@ def define(variant: Variant) -> SimpleNamespace:
         """Place what a stage starts from, and w that its iteration starts at, by the slope of the stage before."""
         i = index(wp.tid())
         h = step_size[0]
+        w1 = first_solution[i]
+        w2 = second_solution[i]
         if is_free[i] == 0:
-            reached = tableau[0]
-            if stage == 1:
-                reached = tableau[1] + tableau[2]
-            if stage == 2:
-                reached = tableau[3] + tableau[4] + tableau[5]
-            base_position[i] = start_position[i] + solution[i] * (h * reached)
-            base_velocity[i] = solution[i]
-            return
-        rate, v, last = base(
-            stage,
-            h,
-            stage_size[0],
-            tableau,
-            start_velocity[i],
-            slope[i],
-            first_solution[i],
-            second_solution[i],
-        )
-        base_position[i] = start_position[i] + rate * h
+            w1 = solution[i]
+            w2 = w1
+        rate, v, last = base(stage, h, stage_size[0], tableau, start_velocity[i], slope[i], w1, w2)
         base_velocity[i] = v
+        if is_free[i] == 0:
+            # it goes at one velocity from the step's start on
+            base_position[i] = start_position[i] + (rate + (w1 - start_velocity[i]) * of_explicit(stage, tableau)) * h
+            return
+        base_position[i] = start_position[i] + rate * h
         if start:
             start[i] = v + last * stage_size[0]
 
@@ -188,7 +170,6 @@ def define(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         ask_for_slope=ask_for_slope,
-        set_stage=set_stage,
         enter_base=enter_base,
         enter_euler_base=enter_euler_base,
         keep_slope=keep_slope,

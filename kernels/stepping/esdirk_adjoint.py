@@ -138,7 +138,7 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_second_solution[a + d] = w2[d]
 
     @wp.kernel(module=module, enable_backward=False)
-    def restore_short_stage(
+    def restore_slope_stage(
         stage_size: wp.array(dtype=scalar),
         is_free: wp.array(dtype=int),
         velocity: wp.array(dtype=vec3),
@@ -215,13 +215,13 @@ def define(variant: Variant) -> SimpleNamespace:
             of_first = tableau[4]
             of_second = tableau[5]
         start_position_grad[i] = start_position_grad[i] + q
-        if is_free[i] == 0:
-            # it moved at one velocity all along
-            solution_grad[i] = solution_grad[i] + q * (h * (of_explicit + of_first + of_second))
-            return
         over = h / stage_size[0]
-        start_velocity_grad[i] = start_velocity_grad[i] + q * (h * of_explicit) + v
-        slope_grad[i] = slope_grad[i] + v * (h * of_explicit)
+        start_velocity_grad[i] = start_velocity_grad[i] + v
+        if is_free[i] != 0:
+            start_velocity_grad[i] = start_velocity_grad[i] + q * (h * of_explicit)
+            slope_grad[i] = slope_grad[i] + v * (h * of_explicit)
+        else:
+            solution_grad[i] = solution_grad[i] + q * (h * of_explicit)
         first_solution_grad[i] = first_solution_grad[i] + (q * h + v * over) * of_first
         first_base_grad[i] = first_base_grad[i] - v * (over * of_first)
         second_solution_grad[i] = second_solution_grad[i] + (q * h + v * over) * of_second
@@ -273,7 +273,7 @@ def define(variant: Variant) -> SimpleNamespace:
         restore_slope=restore_slope,
         restore_stages=restore_stages,
         restore_euler_stages=restore_euler_stages,
-        restore_short_stage=restore_short_stage,
+        restore_slope_stage=restore_slope_stage,
         slope_adjoint=slope_adjoint,
         hand_on=hand_on,
         hand_euler_on=hand_euler_on,

@@ -92,7 +92,7 @@ STEP: Group = {
     "counters": Field("world", 2, "int", "", "always", "the present frame of the chunk, and the present step"),
     "step_size": Field("world", 1, "scalar", "s", "always", "h"),
     "remaining": Field("world", 1, "scalar", "s", "always", "time in which hard pins reach their targets"),
-    "stage_times": Field("world", 5, "scalar", "steps", "always", "of three stages, of the step's end and its start"),
+    "stage_times": Field("world", 6, "scalar", "steps", "always", "of three stages, the step's end and start, a slope"),
     "coefficients": Field("world", 1, "vec3", "1, s, s²", "always", "what M, D and H are multiplied by in the matrix"),
 }
 """What steers a step."""
@@ -255,7 +255,6 @@ EXPLICIT_STAGE: Group = {
     "euler_second_solution": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
     "tableau": Field("world", COEFFICIENTS, "scalar", "", "always", "its coefficients"),
     "asks_for_slope": Field("world", 1, "int", "", "always", "whether the slope is not known"),
-    "stage_settings": Field("world", 4, "scalar", "s, 1", "always", "η, that of a short stage, and their tolerances"),
 }
 """Of methods whose first stage is explicit (``kernels/stepping/esdirk.py``)."""
 
@@ -344,7 +343,6 @@ LAUNCH: Group = {
     "add_contact_load": Field("launch", 1, "int", "", "always", "whether a term is to add to ``contact_load``"),
     "stage": Field("launch", 1, "int", "", "always", "which stage of the step, from 0"),
     "along": Field("launch", 1, "int", "", "always", "direction of lines: 0 warp, 1 weft"),
-    "which": Field("launch", 1, "int", "", "always", "1 of the stage that a slope is found by, else 0"),
     "first": Field("launch", 1, "int", "", "always", "first node of a level"),
     "count": Field("launch", 1, "int", "", "always", "nodes of a level"),
     "thread": Field("launch", 1, "int", "", "always", "which thread of a shared solve, from 0"),

@@ -20,8 +20,9 @@ MEMORY = ("bounds", "steps_to_audit", "audit_due", "alert", "outer_force")
 LOOKED_AT = ("elastic_energy", "height_energy")
 SAME = {wp.float64: 1e-9, wp.float32: 1e-4}
 """Part of energies that rounding, also of where pins are, makes of the same ones."""
-AT_END, AT_START = 3, 4
-"""The places of a step's end and start among ``stage_times``, behind those of three stages."""
+AT_END, AT_START, AT_SLOPE = 3, 4, 5
+"""The places of a step's end and start among ``stage_times``, behind those of three stages, and of the stage that finds
+a slope where no step has left one."""
 
 
 class EnergyWatch:

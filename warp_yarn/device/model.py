@@ -108,7 +108,9 @@ class Model:
         given = self._newton_tolerance
         return defaults.newton_tolerance(self.scene, self.precision, step) if given is None else given
 
-    def set_times(self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,)) -> None:
+    def set_times(
+        self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,), of_slope: float = 1.0
+    ) -> None:
         """Sets the times of the step that kernels make.
 
         Args:
@@ -116,12 +118,15 @@ class Model:
             remaining: time in which exact pins reach their targets [s]; more than h in a part of a step.
             stage: of an implicit stage [s]: the matrix is M + stage · D + stage² · H.
             times: of the stages, in steps: pins with springs are taken to where they are then.
+            of_slope: the same of the stage that finds a slope.
         """
         a = self.arrays
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
-        reached = [1.0 if self.has_hard_pins else begun + time * step / self.step_size for time in (*times, 1.0)]
-        a.put("stage_times", *reached, *[reached[-1]] * (4 - len(reached)), begun)
+        reached = [
+            1.0 if self.has_hard_pins else begun + time * step / self.step_size for time in (of_slope, *times, 1.0)
+        ]
+        a.put("stage_times", *reached[1:], *[reached[-1]] * (5 - len(reached)), begun, reached[0])
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("coefficients", 1.0, stage, stage * stage)

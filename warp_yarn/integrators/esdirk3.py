@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..device import declarations
-from ..device.energy_watch import AT_START
+from ..device.energy_watch import AT_SLOPE, AT_START
 from ..device.model import Model
 from .explicit_adjoint import ExplicitAdjoint
 from .stage import StageMethod
@@ -20,10 +20,6 @@ MIDDLE = 0.6
 """Time of the second implicit stage, in steps."""
 START = 3
 """The place of an explicit stage among ``stage_shares``."""
-SHORT = {"double": 1e-4, "single": 1e-2}
-"""Of a step, the stage that finds a slope which no step has left: velocities that change by less are rounding."""
-SHORT_TOLERANCE = 1e-4
-"""Of that stage at most: what its slope is off is in the whole step."""
 
 
 def tableau() -> tuple[float, ...]:
@@ -41,8 +37,9 @@ class ESDIRK3(StageMethod):
 
     Order 3, stages of order 2, so that stiff yarns take less of it than of "sdirk2", whose stages are of order 1: for
     real fabrics the same accuracy at a tenth of the steps. L-stable and stiffly accurate as that. The slope of the
-    explicit stage is that of the last one of the step before, which no state tells: where a state was set, a stage of
-    10⁻⁴ h finds it first. Kennedy and Carpenter, NASA/TM-2016-219173.
+    explicit stage is that of the last one of the step before, which no state tells. Where a state was set, an implicit
+    stage finds it first: the forces of the state itself are no slope to go on with where its yarns are strained, as
+    they would throw the next stage's base far off. Kennedy and Carpenter, NASA/TM-2016-219173.
     """
 
     name = "esdirk3"
@@ -65,14 +62,11 @@ class ESDIRK3(StageMethod):
     def set_times(self, step: float, remaining: float) -> None:
         """Sets h and the time in which hard pins reach their targets [s] (``Model.set_times``)."""
         model, a, stage = self.model, self.model.arrays, self.fraction * step
-        model.set_times(step, remaining, stage, (2.0 * GAMMA, MIDDLE, 1.0))
+        model.set_times(step, remaining, stage, (2.0 * GAMMA, MIDDLE, 1.0), of_slope=GAMMA)
         a_10, a_20, a_21, b_0, b_1, b_2 = tableau()
         a.put("tableau", a_10, a_20, a_21, b_0, b_1, b_2)
         a.put("stage_shares", b_1, b_2, self.fraction, b_0)
-        tolerance = model.newton_tolerance_at(step)
-        short = SHORT[model.precision] * step, min(tolerance, SHORT_TOLERANCE)
-        a.put("stage_settings", stage, short[0], tolerance, short[1])
-        a.put("newton_tolerance", tolerance)
+        a.put("newton_tolerance", model.newton_tolerance_at(step))
         a.put("stage_size", stage)
 
     def _step(self) -> None:
@@ -80,7 +74,7 @@ class ESDIRK3(StageMethod):
         self._begin()
         self.keep_start()
         model.launch("ask_for_slope", 1)
-        wp.capture_if(a["asks_for_slope"], on_true=self._begin_with_slope)
+        wp.capture_if(a["asks_for_slope"], on_true=self.find_slope)
         for stage in range(self.stages):
             if stage:
                 model.inputs.load(stage)
@@ -94,22 +88,16 @@ class ESDIRK3(StageMethod):
                 model.copy(second_solution="solution", euler_second_solution="euler_solution")
         self._end()
 
-    def _begin_with_slope(self) -> None:
-        self.find_slope()
-        self.model.inputs.load()
-
     def find_slope(self) -> None:
         """Finds the slope at the present state, where the pins' velocities are in the solution."""
-        self.enter_short_stage()
+        self.enter_slope_stage()
         self.newton.solve(0)
         self.model.launch("keep_slope", "nodes")
-        self.model.launch("set_stage", 1, which=0)
+        self.model.inputs.load()
 
-    def enter_short_stage(self) -> None:
-        """Makes the stages to come so short that they find a slope."""
-        self.model.launch("set_stage", 1, which=1)
-        if self.model.inputs.move:
-            self.model.inputs.load(AT_START)
+    def enter_slope_stage(self) -> None:
+        """Starts a stage from the present state."""
+        self.model.inputs.load(AT_SLOPE)
         self.set_base()
 
     def _begin_work(self) -> None:

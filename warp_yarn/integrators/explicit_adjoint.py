@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..device import declarations
-from ..device.energy_watch import AT_START
+from ..device.energy_watch import AT_SLOPE
 from .stage_adjoint import StageAdjoint
 
 STARTS = ("start_position", "start_euler", "start_velocity", "start_euler_velocity")
@@ -45,9 +45,9 @@ class ExplicitAdjoint(StageAdjoint):
             self._solve()
             self._graphs.run(f"leave {stage}", lambda stage=stage: self._hand_on(stage))
         if found:
-            self._run(self._enter_short_stage)
+            self._run(self._enter_slope_stage)
             self._solve()
-            self._run(self._leave_short_stage)
+            self._run(self._leave_slope_stage)
         self._run(self._finish)
 
     def _restore_start(self) -> None:
@@ -78,26 +78,24 @@ class ExplicitAdjoint(StageAdjoint):
         if self.model.scene.sliding:
             self.model.launch("restore_euler_stages", "nodes")
 
-    def _enter_short_stage(self) -> None:
+    def _enter_slope_stage(self) -> None:
         """Enters the stage that the slope was found by; its q̄ and v̄ are those of the step's start."""
         model = self.model
         _, after = self.around
         after(0)
         model.launch("restore_frame", "nodes")
-        self.method.enter_short_stage()
-        model.launch("restore_short_stage", "nodes")
+        self.method.enter_slope_stage()
+        model.launch("restore_slope_stage", "nodes")
         self._hand_back()
         self._enter()
         model.arrays.zero("stage_adjoint", "euler_stage_adjoint")
         model.launch("slope_adjoint", "nodes")
 
-    def _leave_short_stage(self) -> None:
+    def _leave_slope_stage(self) -> None:
         """Leaves it to where the step started."""
         _, after = self.around
         self.model.copy(**{f"{name}_grad": f"base_{name.removeprefix('start_')}_grad" for name in STARTS})
-        if self.model.inputs.move:
-            after(AT_START)
-        self.model.launch("set_stage", 1, which=0)
+        after(AT_SLOPE)
 
     def _enter_stage(self, stage: int) -> None:
         """Enters a stage, and w̄ of what it led to."""
