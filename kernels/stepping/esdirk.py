@@ -152,6 +152,26 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_slope[s] = (euler_solution[s] - base_euler_velocity[s]) / stage_size[0]
 
     @wp.kernel(module=module, enable_backward=False)
+    def extrapolate_slope(
+        stage_size: wp.array(dtype=scalar),
+        is_free: wp.array(dtype=int),
+        solution: wp.array(dtype=vec3),
+        euler_solution: wp.array(dtype=scalar),
+        base_velocity: wp.array(dtype=vec3),
+        base_euler_velocity: wp.array(dtype=scalar),
+        slope: wp.array(dtype=vec3),
+        euler_slope: wp.array(dtype=scalar),
+    ):
+        """Take the slope of a stage, and that of one which goes on from it, back to the start of the first."""
+        i = index(wp.tid())
+        two = scalar(2.0)
+        if is_free[i] != 0:
+            slope[i] = slope[i] * two - (solution[i] - base_velocity[i]) / stage_size[0]
+        if wp.static(sliding):
+            for s in range(2 * i, 2 * i + 2):
+                euler_slope[s] = two * euler_slope[s] - (euler_solution[s] - base_euler_velocity[s]) / stage_size[0]
+
+    @wp.kernel(module=module, enable_backward=False)
     def record_slope(
         nodes: int,
         counters: wp.array(dtype=int),
@@ -173,5 +193,6 @@ def define(variant: Variant) -> SimpleNamespace:
         enter_base=enter_base,
         enter_euler_base=enter_euler_base,
         keep_slope=keep_slope,
+        extrapolate_slope=extrapolate_slope,
         record_slope=record_slope,
     )

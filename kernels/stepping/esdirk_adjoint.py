@@ -138,26 +138,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 euler_second_solution[a + d] = w2[d]
 
     @wp.kernel(module=module, enable_backward=False)
-    def restore_slope_stage(
-        stage_size: wp.array(dtype=scalar),
-        is_free: wp.array(dtype=int),
-        velocity: wp.array(dtype=vec3),
-        euler_velocity: wp.array(dtype=scalar),
-        slope: wp.array(dtype=vec3),
-        euler_slope: wp.array(dtype=scalar),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-    ):
-        """Compute w of the stage that a slope was found by."""
-        i = index(wp.tid())
-        if is_free[i] != 0:
-            solution[i] = velocity[i] + slope[i] * stage_size[0]
-        if wp.static(sliding):
-            for s in range(2 * i, 2 * i + 2):
-                euler_solution[s] = euler_velocity[s] + euler_slope[s] * stage_size[0]
-
-    @wp.kernel(module=module, enable_backward=False)
     def slope_adjoint(
+        share: scalar,
+        is_whole: int,
         stage_size: wp.array(dtype=scalar),
         is_free: wp.array(dtype=int),
         slope_grad: wp.array(dtype=vec3),
@@ -167,19 +150,42 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity_grad: wp.array(dtype=vec3),
         base_euler_velocity_grad: wp.array(dtype=scalar),
     ):
-        """Reverse ``keep_slope``."""
+        """Reverse what a stage's slope gave to that of a step, in this share; is_whole: no other stage is to follow."""
         i = index(wp.tid())
+        by = share / stage_size[0]
         if is_free[i] != 0:
-            g = slope_grad[i] / stage_size[0]
+            g = slope_grad[i] * by
             stage_adjoint[i] = stage_adjoint[i] + g
             base_velocity_grad[i] = base_velocity_grad[i] - g
-        slope_grad[i] = vec3()
+        if is_whole != 0:
+            slope_grad[i] = vec3()
         if wp.static(sliding):
             for s in range(2 * i, 2 * i + 2):
-                g_s = euler_slope_grad[s] / stage_size[0]
+                g_s = euler_slope_grad[s] * by
                 euler_stage_adjoint[s] = euler_stage_adjoint[s] + g_s
                 base_euler_velocity_grad[s] = base_euler_velocity_grad[s] - g_s
-                euler_slope_grad[s] = scalar(0.0)
+                if is_whole != 0:
+                    euler_slope_grad[s] = scalar(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_to_start(
+        base_position_grad: wp.array(dtype=vec3),
+        base_euler_grad: wp.array(dtype=scalar),
+        base_velocity_grad: wp.array(dtype=vec3),
+        base_euler_velocity_grad: wp.array(dtype=scalar),
+        start_position_grad: wp.array(dtype=vec3),
+        start_euler_grad: wp.array(dtype=scalar),
+        start_velocity_grad: wp.array(dtype=vec3),
+        start_euler_velocity_grad: wp.array(dtype=scalar),
+    ):
+        """Add the adjoints of a base that is the step's start to those of the start."""
+        i = index(wp.tid())
+        start_position_grad[i] = start_position_grad[i] + base_position_grad[i]
+        start_velocity_grad[i] = start_velocity_grad[i] + base_velocity_grad[i]
+        for s in range(2 * i, 2 * i + 2):
+            start_euler_grad[s] = start_euler_grad[s] + base_euler_grad[s]
+            if wp.static(sliding):
+                start_euler_velocity_grad[s] = start_euler_velocity_grad[s] + base_euler_velocity_grad[s]
 
     @wp.kernel(module=module, enable_backward=False)
     def hand_on(
@@ -273,8 +279,8 @@ def define(variant: Variant) -> SimpleNamespace:
         restore_slope=restore_slope,
         restore_stages=restore_stages,
         restore_euler_stages=restore_euler_stages,
-        restore_slope_stage=restore_slope_stage,
         slope_adjoint=slope_adjoint,
+        add_to_start=add_to_start,
         hand_on=hand_on,
         hand_euler_on=hand_euler_on,
     )

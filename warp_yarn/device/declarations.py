@@ -362,6 +362,8 @@ LAUNCH: Group = {
     "path": Field("launch", 1, "vec3", "", "always", "an input's rows, step after step"),
     "values": Field("launch", 1, "vec3", "", "always", "an input in this step"),
     "motion": Field("launch", 1, "vec3", "m", "always", "how far it goes in the step"),
+    "share": Field("launch", 1, "scalar", "", "always", "of a stage's slope in that of a step"),
+    "is_whole": Field("launch", 1, "int", "", "always", "whether it is the last stage that gives to it"),
     "start": Field("launch", 1, "vec3", "", "always", "where an iteration, or a path, starts"),
     "euler_start": Field("launch", 1, "scalar", "m/s", "always", "the same of (u, v)"),
     "time": Field("launch", 1, "scalar", "s", "always", "t by which a stage's velocity carries on"),

@@ -89,11 +89,18 @@ class ESDIRK3(StageMethod):
         self._end()
 
     def find_slope(self) -> None:
-        """Finds the slope at the present state, where the pins' velocities are in the solution."""
+        """Finds the slope at the present state, where the pins' velocities are in the solution: of two implicit
+        stages, one after the other, back from the first. They stay in the arrays of the first two solutions."""
+        model = self.model
         self.enter_slope_stage()
         self.newton.solve(0)
-        self.model.launch("keep_slope", "nodes")
-        self.model.inputs.load()
+        model.copy(first_solution="solution", euler_first_solution="euler_solution")
+        model.launch("keep_slope", "nodes")
+        model.inputs.load()
+        self.set_base()
+        self.newton.solve(1)
+        model.copy(second_solution="solution", euler_second_solution="euler_solution")
+        model.launch("extrapolate_slope", "nodes")
 
     def enter_slope_stage(self) -> None:
         """Starts a stage from the present state."""

@@ -45,9 +45,11 @@ class ExplicitAdjoint(StageAdjoint):
             self._solve()
             self._graphs.run(f"leave {stage}", lambda stage=stage: self._hand_on(stage))
         if found:
-            self._run(self._enter_slope_stage)
+            self._run(self._enter_second_slope)
             self._solve()
-            self._run(self._leave_slope_stage)
+            self._run(self._enter_first_slope)
+            self._solve()
+            self._run(self._leave_slope)
         self._run(self._finish)
 
     def _restore_start(self) -> None:
@@ -78,23 +80,34 @@ class ExplicitAdjoint(StageAdjoint):
         if self.model.scene.sliding:
             self.model.launch("restore_euler_stages", "nodes")
 
-    def _enter_slope_stage(self) -> None:
-        """Enters the stage that the slope was found by; its q̄ and v̄ are those of the step's start."""
-        model = self.model
+    def _enter_second_slope(self) -> None:
+        """Enters the second of the stages that the slope was found by."""
+        model, a = self.model, self.model.arrays
+        _, after = self.around
+        after(0)
+        model.launch("restore_frame", "nodes")
+        self._find_slope()
+        self._enter()
+        a.zero_grad("base_position", "base_euler", "base_velocity", "base_euler_velocity")
+        a.zero("stage_adjoint", "euler_stage_adjoint")
+        model.launch("slope_adjoint", "nodes", share=-1.0, is_whole=0)
+
+    def _enter_first_slope(self) -> None:
+        """Enters the first of them, which led to it."""
+        model, a = self.model, self.model.arrays
         _, after = self.around
         after(0)
         model.launch("restore_frame", "nodes")
         self.method.enter_slope_stage()
-        model.launch("restore_slope_stage", "nodes")
-        self._hand_back()
+        model.copy(solution="first_solution", euler_solution="euler_first_solution")
         self._enter()
-        model.arrays.zero("stage_adjoint", "euler_stage_adjoint")
-        model.launch("slope_adjoint", "nodes")
+        model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
+        model.launch("slope_adjoint", "nodes", share=2.0, is_whole=1)
 
-    def _leave_slope_stage(self) -> None:
+    def _leave_slope(self) -> None:
         """Leaves it to where the step started."""
         _, after = self.around
-        self.model.copy(**{f"{name}_grad": f"base_{name.removeprefix('start_')}_grad" for name in STARTS})
+        self.model.launch("add_to_start", "nodes")
         after(AT_SLOPE)
 
     def _enter_stage(self, stage: int) -> None:

@@ -101,7 +101,7 @@ class StageAdjoint:
         else:
             model.launch("carry_adjoint", "nodes", time=a["stage_size"], rate=a["unit"])
         if "slopes" in a.conditions:
-            model.launch("slope_adjoint", "nodes")
+            model.launch("slope_adjoint", "nodes", share=1.0, is_whole=1)
 
     def _enter_first(self) -> None:
         """Enters the stage before it, and w̄ of what it carried to the next."""
