@@ -41,9 +41,11 @@ def test_order_on_a_smooth_motion(method: str, sliding: bool) -> None:
 
     ends = [after(1e-3 / 2**k) for k in range(1, 5)]
     changes = [size(a - b) for a, b in itertools.pairwise(ends)]
-    # successive halvings; the next order's share was seen to be under 0.04
+    # successive halvings; the next order's share was seen to be under 0.04, and of esdirk3, whose first step is of
+    # another kind, 0.12
     for coarse, fine in itertools.pairwise(changes):
-        assert np.log2(coarse / fine) == pytest.approx(INTEGRATORS[method].order, abs=0.05)
+        off = 0.15 if method == "esdirk3" else 0.05
+        assert np.log2(coarse / fine) == pytest.approx(INTEGRATORS[method].order, abs=off)
 
 
 @functools.cache
@@ -62,6 +64,7 @@ ERRORS = {
     "implicit-midpoint": [7.0e-3, 2.9e-3, 7.0e-4, 2.0e-4],
     # physics.md's prototype kept the first stage's matrix for the second: 2.3 % at 0.5 ms, and blown up at 1 ms
     "ros2": [2.9e-2, 4.5e-3, 7.6e-4, 1.35e-4],
+    "esdirk3": [2.2e-3, 6.5e-4, 1.3e-4, 2.4e-5],
 }
 
 
@@ -83,7 +86,7 @@ def test_free_fall(method: str, sliding: bool) -> None:
     fabric = cloth(4, 6, pose="flat", radius=2.4e-4)
     trajectory = wy.Simulator(wy.Scene(fabric, sliding=sliding), integrator=method, **exact).run(20)
     n, h = np.arange(21)[:, None], 1e-3
-    fallen = {1: n * (n + 1), 2: n * n}[ORDER[method]] * (-0.5 * 9.8 * h * h)
+    fallen = {1: n * (n + 1), 2: n * n, 3: n * n}[ORDER[method]] * (-0.5 * 9.8 * h * h)
     # tolerance, relative to a velocity of 0.2 m/s, over 20 ms
     assert np.abs((trajectory.position - trajectory.position[0])[..., 2] - fallen).max() < 1e-12
 
@@ -203,9 +206,14 @@ def test_crossings_never_change_their_order(method: str, terms: list[str]) -> No
     rates[5, 0], rates[6, 0] = 0.2, -0.2
     simulator = wy.Simulator(wy.Scene(fabric, gravity=None, terms=terms), integrator=method)
     simulator.state = wy.State(fabric.position, fabric.euler, np.zeros((fabric.nodes, 3)), rates)
-    with pytest.raises(wy.SimulationError) as error:
-        simulator.run(20)
-    euler = error.value.trajectory.euler.reshape(-1, 4, 4, 2)
+    if method == "esdirk3" and not terms:
+        # without forces M alone, which is singular, turns them round
+        trajectory = simulator.run(20)
+    else:
+        with pytest.raises(wy.SimulationError) as error:
+            simulator.run(20)
+        trajectory = error.value.trajectory
+    euler = trajectory.euler.reshape(-1, 4, 4, 2)
     assert np.diff(euler[..., 0], axis=2).min() > 0.0 and np.diff(euler[..., 1], axis=1).min() > 0.0
 
 

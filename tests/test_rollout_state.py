@@ -287,7 +287,7 @@ def in_parts(rollout: wt.Rollout, parts: int, **inputs: torch.Tensor) -> wt.Fram
 
 
 @pytest.mark.parametrize("every", [1, 2])
-@pytest.mark.parametrize("method", quick(INTEGRATORS, "linear", "sdirk2"))
+@pytest.mark.parametrize("method", quick([name for name in INTEGRATORS if name != "esdirk3"], "linear", "sdirk2"))
 def test_a_run_in_parts_is_the_same_as_at_once(method: str, every: int) -> None:
     options = {"integrator": method, "checkpoint_every": every, **EXACT}
     whole, part = wt.Rollout(scene(6), 6, **options), wt.Rollout(scene(6), 2, **options)

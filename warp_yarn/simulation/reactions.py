@@ -73,8 +73,8 @@ class Steps:
             raise InputError("contact.method is 'impact-zones', must be 'barrier': impact zones have no forces")
         if getattr(stepper.integrator, "made", None) is None:
             raise InputError(
-                f"integrator = {stepper.integrator.name!r}, whose stages are not known: must be one of the package's, "
-                "or a StageMethod"
+                f"integrator = {stepper.integrator.name!r}, whose stages are not known from frames: must be another of "
+                "the package's, or a StageMethod"
             )
         if trajectory is None:
             last = stepper.frames.last_step()
