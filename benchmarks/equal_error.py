@@ -29,6 +29,8 @@ from work_precision import EQ_2
 import warp_yarn as wy
 from warp_yarn.integrators import INTEGRATORS
 
+LARGEST_STEP = 1.25e-2
+"""Where the search begins [s]."""
 MOST_STEPS = 8192
 """A method that needs more of them is left out."""
 
@@ -46,7 +48,7 @@ def steps_to(
     motion: Motion, size: int, method: str, targets: Sequence[float], converged: Reference
 ) -> list[int | None]:
     """The fewest steps from which on a method is nearer than each target, to 3 %; None where it does not get there."""
-    counts = [max(1, round(motion.duration / 5e-3))]
+    counts = [max(1, round(motion.duration / LARGEST_STEP))]
     errors = [error(motion, size, method, counts[0], converged)]
     while errors[-1] > min(targets) and 2 * counts[-1] <= MOST_STEPS:
         counts.append(2 * counts[-1])

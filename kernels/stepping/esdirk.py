@@ -14,8 +14,9 @@ import warp as wp
 from ..core.indexing import index
 from ..core.variant import Variant
 
-COEFFICIENTS = 6
-"""Of a tableau: a₁₀, a₂₀, a₂₁, b₀, b₁, b₂."""
+COEFFICIENTS = 10
+"""Of a tableau: a₁₀, a₂₀, a₂₁, b₀, b₁, b₂; and the shares of slopes before in what is expected of those of the second
+implicit stage (of the first one's; the rest is the explicit one's) and of the third."""
 
 
 @functools.cache
@@ -44,23 +45,23 @@ def define(variant: Variant) -> SimpleNamespace:
         w1: vec3,
         w2: vec3,
     ):
-        """Compute ((q_i − q)/h, v_i, the slope of the stage before) of an implicit stage i, from 0 on."""
+        """Compute ((q_i − q)/h, v_i, q̈_i as the slopes before let expect it) of an implicit stage i, from 0 on."""
         v_1 = v + slope * (h * a[0])
         rate = v * a[0]
         start = v_1
-        last = slope
+        expected = slope
         if stage > 0:
             slope_1 = (w1 - v_1) / eta
             v_2 = v + (slope * a[1] + slope_1 * a[2]) * h
             rate = v * a[1] + w1 * a[2]
             start = v_2
-            last = slope_1
+            expected = slope + (slope_1 - slope) * a[6]
             if stage > 1:
                 slope_2 = (w2 - v_2) / eta
                 rate = v * a[3] + w1 * a[4] + w2 * a[5]
                 start = v + (slope * a[3] + slope_1 * a[4] + slope_2 * a[5]) * h
-                last = slope_2
-        return rate, start, last
+                expected = slope * a[7] + slope_1 * a[8] + slope_2 * a[9]
+        return rate, start, expected
 
     @wp.kernel(module=module, enable_backward=False)
     def enter_base(
@@ -79,7 +80,7 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity: wp.array(dtype=vec3),
         start: wp.array(dtype=vec3),
     ):
-        """Place what a stage starts from, and w that its iteration starts at, by the slope of the stage before."""
+        """Place what a stage starts from, and w that its iteration starts at, by the slopes before."""
         i = index(wp.tid())
         h = step_size[0]
         w1 = first_solution[i]
@@ -87,7 +88,7 @@ def define(variant: Variant) -> SimpleNamespace:
         if is_free[i] == 0:
             w1 = solution[i]
             w2 = w1
-        rate, v, last = base(stage, h, stage_size[0], tableau, start_velocity[i], slope[i], w1, w2)
+        rate, v, expected = base(stage, h, stage_size[0], tableau, start_velocity[i], slope[i], w1, w2)
         base_velocity[i] = v
         if is_free[i] == 0:
             # it goes at one velocity from the step's start on
@@ -95,7 +96,7 @@ def define(variant: Variant) -> SimpleNamespace:
             return
         base_position[i] = start_position[i] + rate * h
         if start:
-            start[i] = v + last * stage_size[0]
+            start[i] = v + expected * stage_size[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def enter_euler_base(
@@ -117,7 +118,7 @@ def define(variant: Variant) -> SimpleNamespace:
             a = 2 * i
             b = 2 * i + 1
             zero = scalar(0.0)
-            rate, v, _last = base(
+            rate, v, _expected = base(
                 stage,
                 step_size[0],
                 stage_size[0],
