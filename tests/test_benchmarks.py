@@ -265,8 +265,8 @@ def test_the_largest_step_that_reaches_an_error_is_found(monkeypatch, order, tar
     monkeypatch.setattr(equal, "error", lambda motion, size, method, steps, converged: (2.0 / steps) ** order)
     motion = motions.MOTIONS["hung"]
     found, never = equal.steps_to(motion, 5, "linear", (target, 1e-9), None)
-    # 3 % more steps than needed at most, or one; 25 ms begin with 5 steps
-    needed = max(5.0, 2.0 / target ** (1.0 / order))
+    # 3 % more steps than needed at most, or one; 25 ms begin with 2 steps
+    needed = max(2.0, 2.0 / target ** (1.0 / order))
     assert needed <= found <= max(1.031 * needed, needed + 1.0)
     assert never is None
 

@@ -66,8 +66,8 @@ class Simulator(Loads, Filming):
         scene: the scene.
         step: h, time step [s], above 0.
         integrator: the method, by its name: "sdirk2" (order 2, strongly damped), "linear" (eq. 2 of the paper, order
-            1), "implicit-euler" (order 1), "implicit-midpoint" (order 2, undamped) or "ros2" (order 2, for short
-            steps); see ``warp_yarn/integrators``.
+            1), "implicit-euler" (order 1), "implicit-midpoint" (order 2, undamped), "ros2" (order 2, for short steps)
+            or "esdirk3" (order 3, for real fabrics without contact); see ``warp_yarn/integrators``.
         device: a Warp device, such as "cpu" or "cuda:0".
         precision: "double" or "single".
         preconditioner: of the conjugate gradient, a file of ``kernels/linear`` each: "multilevel", "incomplete" or
