@@ -93,7 +93,7 @@ class ESDIRK3(StageMethod):
         for stage in range(self.stages):
             if stage:
                 model.inputs.load(stage)
-                model.launch("ask_for_matrix", "segments")
+                self.newton.ask_for_matrix()
             self.enter_base(stage, start=a["solution"])
             self.newton.solve(stage)
             model.energy.add_work(stage)

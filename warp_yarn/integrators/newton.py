@@ -51,8 +51,8 @@ class Newton:
         self.model.assemble(matrix=matrix, mass=mass, step_size=a["stage_size"])
 
     def solve(self, stage: int) -> None:
-        """Solves a stage. Its first two steps have the matrix of its start, and a second stage that of the first where
-        one step was enough there and yarns hardly turn."""
+        """Solves a stage. Its first two steps have the matrix of its start, and a later stage may begin with the one
+        before's (``ask_for_matrix``)."""
         a = self.model.arrays
         a.zero("evaluations", "steps", "direction", "euler_direction", "asks_for_compression")
         self.compression.forget()
@@ -69,6 +69,13 @@ class Newton:
             self._evaluate_as_asked()
         self._control()
         wp.capture_while(a["iterate"], lambda: self._iterate(stage))
+
+    def ask_for_matrix(self) -> None:
+        """Asks for a matrix of the next stage's own where yarns turn in a step, or are stiff, so that any turn makes
+        another one, and the stage before took more than one step of the iteration."""
+        if self.model.preconditioner != "multilevel":
+            self.model.arrays.zero("rebuild_matrix")
+        self.model.launch("ask_for_matrix", "segments")
 
     def refuse_impact(self) -> None:
         """Leave an impact to the fallback of a method that has one."""

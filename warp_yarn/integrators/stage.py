@@ -57,7 +57,7 @@ class StageMethod:
         for stage in range(self.stages):
             if stage:
                 model.inputs.load(stage)
-                model.launch("ask_for_matrix", "segments")
+                self.newton.ask_for_matrix()
                 model.launch("next_base", "nodes", start=model.arrays["solution"])
                 if estimates:
                     model.copy(predicted="solution")
