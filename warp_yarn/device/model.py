@@ -103,10 +103,10 @@ class Model:
         self.threads = Threads(self, integer("threads", threads, least=1))
         self.arrays.put("tolerance", self.tolerance)
 
-    def newton_tolerance_at(self, step: float) -> float:
-        """Give the tolerance that was asked for, or what follows the error of steps of this size [s]."""
+    def newton_tolerance_at(self, step: float, share: float = 1.0) -> float:
+        """Give the tolerance that was asked for, or a share of what follows the error of steps of this size [s]."""
         given = self._newton_tolerance
-        return defaults.newton_tolerance(self.scene, self.precision, step) if given is None else given
+        return share * defaults.newton_tolerance(self.scene, self.precision, step) if given is None else given
 
     def set_times(
         self, step: float, remaining: float, stage: float, times: tuple[float, ...] = (1.0,), of_slope: float = 1.0
