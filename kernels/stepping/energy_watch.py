@@ -52,11 +52,14 @@ def define(variant: Variant) -> SimpleNamespace:
         # E + W since the last audit, and since the start; energy beside gravity at the last audit; the last step's
         # power, its yarns' energy, and energy beside gravity; the most of that of late
         elastic_energy: wp.array(dtype=scalar),
+        still_energy: wp.array(dtype=scalar),
         bounds: wp.array(dtype=scalar),
+        alert: wp.array(dtype=int),
         steps_to_audit: wp.array(dtype=int),
         audit_due: wp.array(dtype=int),
     ):
-        """Takes all of the energy at the beginning of a step for E."""
+        """Takes all of the energy at the beginning of a step for E; where it was gained unseen, as other terms hold
+        more than was gained, the steps to come are looked at closely."""
         total = energy[0] + elastic_energy[0] + height_energy[0]
         # a run that has not made a step has no power yet
         if bounds[3] < scalar(-1.0e30):
@@ -65,6 +68,10 @@ def define(variant: Variant) -> SimpleNamespace:
             bounds[4] = elastic_energy[0]
             bounds[6] = energy[0] + elastic_energy[0]
         else:
+            most = wp.max(energy[0] + elastic_energy[0], bounds[6])
+            room = scalar(GAIN) * most + still_energy[0] + scalar(1.0e-9) * wp.abs(height_energy[0])
+            if total > wp.min(bounds[0], bounds[1]) + room:
+                alert[0] = wp.static(ALERT)
             bounds[0] = wp.min(bounds[0], total)
         bounds[2] = energy[0] + elastic_energy[0]
         steps_to_audit[0] = wp.static(EVERY)

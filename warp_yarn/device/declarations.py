@@ -216,7 +216,7 @@ NEWTON_WORKSPACE: Group = {
     "carried_time": Field("world", 1, "scalar", "s", "always", "t by which a stage's velocity carries on"),
     "carried_rate": Field("world", 1, "scalar", "", "always", "k by which its gain of velocity carries on"),
     "unit": Field("world", 1, "scalar", "", "always", "1"),
-    "stage_shares": Field("world", 4, "scalar", "", "always", "of three stages in a step, and of its start"),
+    "stage_shares": Field("world", 6, "scalar", "", "always", "of stages in a step: three, its start's, and two there"),
     "newton_tolerance": Field("world", 1, "scalar", "", "always", "of what is left of the velocities to find"),
     "inner_tolerance": Field("world", 1, "scalar", "", "always", "of the linear solves in an iteration"),
     "residual_norm": Field("world", 1, "scalar", "√J", "always", "‖r‖, and ‖ρ‖ of an adjoint solve"),

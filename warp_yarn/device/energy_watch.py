@@ -117,7 +117,7 @@ class EnergyWatch:
         self.model.arrays.zero("stage_work")
 
     def add_work(self, stage: int) -> None:
-        """Adds the work that is done at the present state in the share of a stage; 3: of one at the step's start."""
+        """Adds the work that is done at the present state in the share of a stage (of ``stage_shares``)."""
         if self.on:
             self._add_powers()
             self.model.launch("add_work", 1, stage=stage)

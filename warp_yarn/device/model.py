@@ -184,16 +184,24 @@ class Model:
 
     def memory(self) -> dict[str, np.ndarray]:
         """Copies what steps left to those that come, beside the state."""
-        slopes = [name for name in SLOPES if self.arrays.get(name) is not None]
-        return self.energy.memory() | {name: self.arrays.values_of(name).copy() for name in slopes}
+        return self.energy.memory() | self.slopes()
+
+    def slopes(self) -> dict[str, np.ndarray]:
+        """Copies the slopes of the last step, of methods that keep them."""
+        names = [name for name in SLOPES if self.arrays.get(name) is not None]
+        return {name: self.arrays.values_of(name).copy() for name in names}
+
+    def put_slopes(self, slopes: dict[str, np.ndarray]) -> None:
+        """Puts slopes in place that go with the present state, of those that there are."""
+        for name in SLOPES:
+            array = self.arrays.get(name)
+            if array is not None and name in slopes and slopes[name].shape == array.numpy().shape:
+                array.assign(slopes[name].astype(array.numpy().dtype))
 
     def go_on(self, memory: dict[str, np.ndarray], steps_done: int) -> None:
         """Goes on from the present state by what another one's ``memory`` gave there after so many steps."""
         self.energy.go_on(memory, steps_done)
-        for name in SLOPES:
-            array = self.arrays.get(name)
-            if array is not None and name in memory and memory[name].shape == array.numpy().shape:
-                array.assign(memory[name].astype(array.numpy().dtype))
+        self.put_slopes(memory)
 
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""

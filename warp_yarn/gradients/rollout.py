@@ -136,7 +136,8 @@ class Rollout:
                 ``last`` of another call's frames, or a State of a Simulator. Where euler is given without anchor, as
                 None here, friction's springs start unstrained.
             steps_done: how many steps were made before the state, by which pin_path and forces are looked up, at
-                least 0. A run in parts is the same as at once: ``rollout(state=frames.last, steps_done=10)``.
+                least 0. A run in parts is the same as at once: ``rollout(state=frames.last, steps_done=10)``, but with
+                "esdirk3", which goes on by a slope that no state tells.
             inputs: tensors, or arrays of numbers.
 
         Raises:

@@ -19,8 +19,8 @@ GAMMA = 0.43586652150845899942
 """The root of γ³ − 3 γ² + 3/2 γ − 1/6 for which methods of three implicit stages are L-stable."""
 MIDDLE = 0.6
 """Time of the second implicit stage, in steps."""
-START = 3
-"""The place of an explicit stage among ``stage_shares``."""
+START, SLOPES = 3, (4, 5)
+"""The places of the explicit stage among ``stage_shares``, and of the two stages that find its slope."""
 
 OF_TOLERANCE = 0.1
 """Of the default tolerance of other methods, as its steps are so much less off: on the sixty random scenes of
@@ -84,7 +84,7 @@ class ESDIRK3(StageMethod):
         model.set_times(step, remaining, stage, (2.0 * GAMMA, MIDDLE, 1.0), of_slope=GAMMA)
         *_, b_0, b_1, b_2 = tableau()
         a.put("tableau", *tableau(), *expectations())
-        a.put("stage_shares", b_1, b_2, self.fraction, b_0)
+        a.put("stage_shares", b_1, b_2, self.fraction, b_0, 2.0 * b_0, -b_0)
         a.put("newton_tolerance", model.newton_tolerance_at(step, OF_TOLERANCE))
         a.put("stage_size", stage)
 
@@ -93,7 +93,7 @@ class ESDIRK3(StageMethod):
         self._begin()
         self.keep_start()
         model.launch("ask_for_slope", 1)
-        wp.capture_if(a["asks_for_slope"], on_true=self.find_slope)
+        wp.capture_if(a["asks_for_slope"], on_true=self.find_slope, on_false=self._add_work_of_slope)
         for stage in range(self.stages):
             if stage:
                 model.inputs.load(stage)
@@ -113,24 +113,27 @@ class ESDIRK3(StageMethod):
         model = self.model
         self.enter_slope_stage()
         self.newton.solve(0)
+        model.energy.add_work(SLOPES[0])
         model.copy(first_solution="solution", euler_first_solution="euler_solution")
         model.launch("keep_slope", "nodes")
         model.inputs.load()
         self.set_base()
         self.newton.solve(1)
+        model.energy.add_work(SLOPES[1])
         model.copy(second_solution="solution", euler_second_solution="euler_solution")
         model.launch("extrapolate_slope", "nodes")
+
+    def _add_work_of_slope(self) -> None:
+        """Adds the work of the explicit stage, at the step's start."""
+        if self.model.inputs.move:
+            self.model.inputs.load(AT_START)
+        self.model.energy.add_work(START)
+        self.model.inputs.load()
 
     def enter_slope_stage(self) -> None:
         """Starts a stage from the present state."""
         self.model.inputs.load(AT_SLOPE)
         self.set_base()
-
-    def _begin_work(self) -> None:
-        super()._begin_work()
-        if self.model.inputs.move:
-            self.model.inputs.load(AT_START)
-        self.model.energy.add_work(START)
 
     def keep_start(self) -> None:
         """Keeps the state that the step starts from."""

@@ -44,7 +44,7 @@ class StageMethod:
         a.put("stage_size", stage)
         a.put("carried_time", self.carried * step)
         a.put("carried_rate", self.carried / self.fraction)
-        a.put("stage_shares", *self._shares, *[0.0] * (4 - self.stages))
+        a.put("stage_shares", *self._shares, *[0.0] * (6 - self.stages))
 
     def advance(self) -> None:
         """Makes a step, and records it: one captured graph, whose loops end on the device."""
@@ -109,17 +109,13 @@ class StageMethod:
         """Starts from the present state, at the present velocity."""
         model = self.model
         model.begin_step()
-        self._begin_work()
+        model.energy.begin_work()
         model.inputs.load()
         model.arrays.zero("newton_iterations", "node_mass")
         model.launch("lump_mass", "segments")
         model.copy(solution="velocity", euler_solution="euler_velocity")
         model.set_pin_velocity()
         self.set_base()
-
-    def _begin_work(self) -> None:
-        """Begins to add up the work that is done in a step."""
-        self.model.energy.begin_work()
 
     def set_base(self) -> None:
         self.model.copy(

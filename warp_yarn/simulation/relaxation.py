@@ -73,11 +73,12 @@ class Relaxation:
     def find(self) -> Relaxed:
         """Finds the equilibrium, and makes it the simulator's state."""
         start, model = self.frames.state(), self.model
-        watched = model.energy.on
+        watched, slopes = model.energy.on, model.slopes()
 
         def go_home() -> None:
             model.energy.on = watched
             self.frames.upload(start)
+            model.put_slopes(slopes)
             model.energy.forget()
             self.arrays.put("status", 0, 0, 0)
             self.stepper.integrator.set_times(model.step_size, model.step_size)
