@@ -21,6 +21,7 @@ import scipy.optimize
 import tqdm
 import warp as wp
 from warp_yarn.kernels import Variant
+from warp_yarn.kernels.core.structs import structs
 from warp_yarn.kernels.terms import wind
 
 import warp_yarn as wy
@@ -89,7 +90,8 @@ class Sheet:
         self.graph = capture.graph
 
     def _prepare_wind(self, scene: wy.Scene) -> None:
-        self.wind = wind.define(Variant(wp.float32, sliding=False))
+        variant = Variant(wp.float32, sliding=False)
+        self.wind, self.no_matrix = wind.define(variant), structs(variant).BlockMatrix()
         self.triangles = wp.array(scene.cloth.topology.triangle_nodes, dtype=wp.vec3i, device="cpu")
         numbers = (scene.wind.density * G / MM**3, scene.wind.drag * G / MM**2)
         velocity = wp.array([np.array(scene.wind.velocity) * MM], dtype=wp.vec3, device="cpu")
@@ -101,7 +103,8 @@ class Sheet:
         for _ in range(SUBSTEPS):
             state.clear_forces()
             moving = [state.particle_q, state.particle_qd, state.particle_f]
-            arguments = [self.triangles, None, *self.air, *moving, None, 0, None, None, None]
+            # no blocks, gusts, momentum and matrix
+            arguments = [self.triangles, None, *self.air, None, *moving, None, 0, self.no_matrix]
             wp.launch(self.wind, dim=len(self.triangles), inputs=arguments, device="cpu")
             self.solver.step(state, result, None, None, paper.STEP / SUBSTEPS)
             state, result = result, state
