@@ -10,8 +10,8 @@ import dataclasses
 
 from ..description.strips import SOURCES
 from ..kernels.linear.block_tridiagonal import factor_size
-from ..kernels.stepping.esdirk import COEFFICIENTS
 from .contact_declarations import CONTACT, CONTACT_INPUTS, CRIMP
+from .explicit_declarations import EXPLICIT_ADJOINT, EXPLICIT_STAGE, SLOPES
 from .fields import Field, Group
 
 TOPOLOGY: Group = {
@@ -240,24 +240,6 @@ NEWTON_WORKSPACE: Group = {
 }
 """Of implicit stages and Newton's iteration."""
 
-SLOPES: Group = {
-    "slope": Field("node", 1, "vec3", "m/s²", "slopes", "of the last stage of the step before; NaN: not known"),
-    "euler_slope": Field("node", 2, "scalar", "m/s²", "slopes of sliding", "the same of (u, v)"),
-}
-"""What a step leaves to the next beside the state, by methods whose first stage is explicit."""
-
-EXPLICIT_STAGE: Group = {
-    "start_position": Field("node", 1, "vec3", "m", "always", "x that the step started from"),
-    "start_euler": Field("node", 2, "scalar", "m", "always", "(u, v)"),
-    "start_velocity": Field("node", 1, "vec3", "m/s", "always", "ẋ"),
-    "start_euler_velocity": Field("node", 2, "scalar", "m/s", "sliding", "(u̇, v̇)"),
-    "second_solution": Field("node", 1, "vec3", "m/s", "always", "w₂"),
-    "euler_second_solution": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
-    "tableau": Field("world", COEFFICIENTS, "scalar", "", "always", "its coefficients"),
-    "asks_for_slope": Field("world", 1, "int", "", "always", "whether the slope is not known"),
-}
-"""Of methods whose first stage is explicit (``kernels/stepping/esdirk.py``)."""
-
 COMPRESSION: Group = {
     "compressed": Field("world", 1, "int", "", "Newton's iteration", "whether solves are of A − G"),
     "indefinite": Field("world", 1, "int", "", "Newton's iteration", "whether one found that to be indefinite"),
@@ -321,14 +303,6 @@ CARRIED_ADJOINT: Group = {
     "euler_stage_adjoint": Field("node", 2, "scalar", "of the loss", "sliding", "the same of (u, v)"),
 }
 """Of the adjoint of methods with stages."""
-
-EXPLICIT_ADJOINT: Group = {
-    "first_base": Field("node", 1, "vec3", "m/s", "always", "v₁ that the first implicit stage starts from"),
-    "euler_first_base": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
-    "second_base": Field("node", 1, "vec3", "m/s", "always", "v₂ of the second"),
-    "euler_second_base": Field("node", 2, "scalar", "m/s", "sliding", "the same of (u, v)"),
-}
-"""Of the adjoint of methods whose first stage is explicit: only their gradients are used."""
 
 STAGE_ADJOINT: Group = {
     "zero": Field("node", 1, "vec3", "", "always", "0 in place of w̄"),

@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ..description.levels import BLOCKS
@@ -21,12 +20,13 @@ from ..kernels.core.general import NUMBERS
 from . import defaults, start
 from .arrays import Arrays
 from .contact import Contact
-from .declarations import INPUTS, SLOPES
+from .declarations import INPUTS
 from .declared import arguments
 from .defaults import PRECISIONS, PRECONDITIONERS
 from .energy_watch import AT_END, EnergyWatch
 from .impact_zones import ImpactZones
 from .inputs import Inputs
+from .memory import record
 from .threads import SOLVED, Threads
 
 MATRIX = (
@@ -123,10 +123,8 @@ class Model:
         a = self.arrays
         begun = 1.0 - remaining / self.step_size
         # what holds exactly goes straight to the place at the end of the whole step
-        reached = [
-            1.0 if self.has_hard_pins else begun + time * step / self.step_size for time in (of_slope, *times, 1.0)
-        ]
-        a.put("stage_times", *reached[1:], *[reached[-1]] * (5 - len(reached)), begun, reached[0])
+        after = [1.0 if self.has_hard_pins else begun + t * step / self.step_size for t in (of_slope, *times, 1.0)]
+        a.put("stage_times", *after[1:], *[after[-1]] * (5 - len(after)), begun, after[0])
         a.put("step_size", step)
         a.put("remaining", remaining)
         a.put("coefficients", 1.0, stage, stage * stage)
@@ -167,7 +165,7 @@ class Model:
         a.zero(*SUMS)
         if matrix:
             a.zero(*MATRIX)
-        self._find_normals(matrix=matrix)
+        _find_normals(self, matrix=matrix)
         for term in a.terms:
             arrays = (mass or {}) if term.name == "mass" else others
             filled = int(matrix and term.name not in explicit)
@@ -176,37 +174,10 @@ class Model:
                 self.contact.samples.scatter(matrix=matrix)
         self.launch("right_hand_side", "nodes", **replaced)
 
-    def _find_normals(self, *, matrix: bool = False) -> None:
-        """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
-        if self.arrays.contact:
-            _find_crossings(self)
-        self.contact.find(matrix=matrix)
-
-    def memory(self) -> dict[str, np.ndarray]:
-        """Copies what steps left to those that come, beside the state."""
-        return self.energy.memory() | self.slopes()
-
-    def slopes(self) -> dict[str, np.ndarray]:
-        """Copies the slopes of the last step, of methods that keep them."""
-        names = [name for name in SLOPES if self.arrays.get(name) is not None]
-        return {name: self.arrays.values_of(name).copy() for name in names}
-
-    def put_slopes(self, slopes: dict[str, np.ndarray]) -> None:
-        """Puts slopes in place that go with the present state, of those that there are."""
-        for name in SLOPES:
-            array = self.arrays.get(name)
-            if array is not None and name in slopes and slopes[name].shape == array.numpy().shape:
-                array.assign(slopes[name].astype(array.numpy().dtype))
-
-    def go_on(self, memory: dict[str, np.ndarray], steps_done: int) -> None:
-        """Goes on from the present state by what another one's ``memory`` gave there after so many steps."""
-        self.energy.go_on(memory, steps_done)
-        self.put_slopes(memory)
-
     def add_contact_load(self) -> None:
         """Fills contact normals and loads alone, where a term of the scene needs them."""
         a = self.arrays
-        self._find_normals()
+        _find_normals(self, matrix=False)
         # the forces go where the solver works
         unused = {"force": a["q_x"], "euler_force": a["q_s"]}
         for term in a.terms:
@@ -264,13 +235,14 @@ class Model:
         self.energy.end_step(by_stages=by_stages)
         self.update_anchor("euler", "anchor")
         self.launch("count", 1, by=1)
-        self.record()
+        record(self)
 
-    def record(self) -> None:
-        """Records the present state as the present frame."""
-        self.launch("record", "nodes")
-        if "slopes" in self.arrays.conditions:
-            self.launch("record_slope", "nodes")
+
+def _find_normals(model: Model, *, matrix: bool) -> None:
+    """Fills contact normals, where a term of the scene needs them, for terms to add to the loads."""
+    if model.arrays.contact:
+        _find_crossings(model)
+    model.contact.find(matrix=matrix)
 
 
 def _find_crossings(model: Model) -> None:

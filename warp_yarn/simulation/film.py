@@ -15,6 +15,7 @@ import tqdm
 
 from ..description.scene import Scene
 from ..device.exclusive import ALONE
+from ..device.memory import go_on, memory
 from ..errors import InputError
 from ..io.files import deferred
 from ..io.films import RECORDINGS, film, open_films
@@ -172,7 +173,7 @@ class Filming:
         if end is not None:
             simulator.substepping.next_size = end.next_size
             with ALONE:
-                simulator.stepper.model.go_on(end.watched, end.steps_done)
+                go_on(simulator.stepper.model, end.watched, end.steps_done)
         return simulator
 
     @property
@@ -200,7 +201,7 @@ class Filming:
     @alone
     def _end(self) -> End:
         """Gives what a run goes on from that ends here."""
-        return End(self.state, self.steps_done, self.substepping.next_size, self.stepper.model.memory())
+        return End(self.state, self.steps_done, self.substepping.next_size, memory(self.stepper.model))
 
 
 class Walk:

@@ -12,6 +12,7 @@ import warp as wp
 from ..device.arrays import MOVING, STATE_TYPES
 from ..device.declarations import SLOPES
 from ..device.exclusive import ALONE
+from ..device.memory import memory
 from ..device.model import Model
 from ..errors import InputError
 from .checks import FRAME_BYTES
@@ -199,5 +200,5 @@ class Frames:
         filled, _ = recording.kept
         frames = recording.trajectory.cut(filled)
         if filled:
-            frames.end = End(self.state(), steps_done, next_size, self.model.memory())
+            frames.end = End(self.state(), steps_done, next_size, memory(self.model))
         return frames

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..description.sanity import GRAVITY
 from ..device.exclusive import ALONE
+from ..device.memory import put_slopes, slopes
 from ..device.model import Model
 from ..errors import InputError, SimulationError, integer, real
 from ..integrators.implicit_euler import ImplicitEuler
@@ -73,12 +74,12 @@ class Relaxation:
     def find(self) -> Relaxed:
         """Finds the equilibrium, and makes it the simulator's state."""
         start, model = self.frames.state(), self.model
-        watched, slopes = model.energy.on, model.slopes()
+        watched, kept = model.energy.on, slopes(model)
 
         def go_home() -> None:
             model.energy.on = watched
             self.frames.upload(start)
-            model.put_slopes(slopes)
+            put_slopes(model, kept)
             model.energy.forget()
             self.arrays.put("status", 0, 0, 0)
             self.stepper.integrator.set_times(model.step_size, model.step_size)

@@ -11,6 +11,7 @@ import numpy as np
 from ..description.sanity import warn_of_rounding
 from ..description.scene import Scene
 from ..device.exclusive import ALONE, compiling, refuse_recording
+from ..device.memory import go_on, memory
 from ..device.model import Model
 from ..errors import InputError, choice, flag, integer
 from ..integrators import INTEGRATORS
@@ -155,7 +156,7 @@ class Simulator(Loads, Filming):
             names = [name for name in (*BESIDE_TERMS, *parameters()) if name in self.arrays]
             values = {name: self.arrays[name].numpy().copy() for name in names}
             steps = (self.steps_done, dict(self.split_steps), set(self.damped_steps))
-            rest = (self.state, *steps, self.substepping.next_size, values, self.model.memory())
+            rest = (self.state, *steps, self.substepping.next_size, values, memory(self.model))
         return _rebuilt, (type(self), self.scene, self._options, *rest)
 
     @alone
@@ -307,7 +308,7 @@ def _rebuilt(
         for name, value in values.items():
             result.arrays[name].assign(value)
         result.stepper.frames.upload(state)
-        result.model.go_on(watched, steps_done)
+        go_on(result.model, watched, steps_done)
     stepper = result.stepper
     stepper.steps_done, stepper.split_steps, stepper.damped_steps = steps_done, split_steps, damped_steps
     stepper.substepping.next_size = size

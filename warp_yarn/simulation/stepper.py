@@ -11,6 +11,7 @@ import numpy as np
 
 from ..device.exclusive import ALONE, compiling, refuse_recording, uninterrupted
 from ..device.graphs import GraphCache
+from ..device.memory import record
 from ..device.model import Model
 from ..errors import InputError
 from ..kernels.core.status import CROWDED, GAINED, IMPACT
@@ -159,7 +160,7 @@ class Stepper:
             raise InputError(f"steps = {steps} after {base}, must end at step {LARGEST} at most")
         self.arrays.put("status", 0, 0, 0)
         self._count(0)
-        self._graphs.run("record", self.model.record)
+        self._graphs.run("record", lambda: record(self.model))
         self._chunk = base
         made = 0
         while made < steps:
