@@ -45,6 +45,11 @@ def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3 = variant.scalar, variant.vec3
     module = variant.module("ledger")
 
+    @wp.func
+    def allowed_gain(most: scalar, still: scalar, height: scalar) -> scalar:
+        """Compute the energy that any step may gain, of the most beside gravity, and of rounding."""
+        return scalar(GAIN) * most + still + scalar(1.0e-9) * wp.abs(height)
+
     @wp.kernel(module=module, enable_backward=False)
     def audit(
         energy: wp.array(dtype=scalar),
@@ -69,8 +74,7 @@ def define(variant: Variant) -> SimpleNamespace:
             bounds[6] = energy[0] + elastic_energy[0]
         else:
             most = wp.max(energy[0] + elastic_energy[0], bounds[6])
-            room = scalar(GAIN) * most + still_energy[0] + scalar(1.0e-9) * wp.abs(height_energy[0])
-            if total > wp.min(bounds[0], bounds[1]) + room:
+            if total > wp.min(bounds[0], bounds[1]) + allowed_gain(most, still_energy[0], height_energy[0]):
                 alert[0] = wp.static(ALERT)
             bounds[0] = wp.min(bounds[0], total)
         bounds[2] = energy[0] + elastic_energy[0]
@@ -169,7 +173,7 @@ def define(variant: Variant) -> SimpleNamespace:
             before = wp.max(bounds[2], bounds[5])
             # the most of late: a cloth that swings has none of it at its highest
             most = wp.max(wp.max(inner, before), bounds[6])
-            room = scalar(GAIN) * most + still_energy[0] + scalar(1.0e-9) * wp.abs(height_energy[0])
+            room = allowed_gain(most, still_energy[0], height_energy[0])
             if gain[0] > scalar(GAIN) or by_stages == 0:
                 room += scalar(BLOW_UP) * wp.max(inner, before)
             bound = wp.min(bounds[0], bounds[1])

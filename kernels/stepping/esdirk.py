@@ -20,19 +20,32 @@ implicit stage (of the first one's; the rest is the explicit one's) and of the t
 
 
 @functools.cache
+def functions(variant: Variant) -> SimpleNamespace:
+    """Define what a tableau says of a stage."""
+    scalar, vec3 = variant.scalar, variant.vec3
+
+    @wp.func
+    def row(stage: int, a: wp.array(dtype=scalar)) -> vec3:
+        """Look up (a_i0, a_i1, a_i2)."""
+        if stage == 0:
+            return vec3(a[0], scalar(0.0), scalar(0.0))
+        if stage == 1:
+            return vec3(a[1], a[2], scalar(0.0))
+        return vec3(a[3], a[4], a[5])
+
+    return SimpleNamespace(row=row)
+
+
+@functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    row = functions(variant).row
     module = variant.module("esdirk")
 
     @wp.kernel(module=module, enable_backward=False)
     def ask_for_slope(slope: wp.array(dtype=vec3), asks_for_slope: wp.array(dtype=int)):
         """Look whether the slope is not known."""
         asks_for_slope[0] = wp.where(wp.isnan(slope[0][0]), 1, 0)
-
-    @wp.func
-    def of_explicit(stage: int, a: wp.array(dtype=scalar)) -> scalar:
-        """Look up a_i0."""
-        return wp.where(stage == 0, a[0], wp.where(stage == 1, a[1], a[3]))
 
     @wp.func
     def base(
@@ -92,7 +105,7 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity[i] = v
         if is_free[i] == 0:
             # it goes at one velocity from the step's start on
-            base_position[i] = start_position[i] + (rate + (w1 - start_velocity[i]) * of_explicit(stage, tableau)) * h
+            base_position[i] = start_position[i] + (rate + (w1 - start_velocity[i]) * row(stage, tableau)[0]) * h
             return
         base_position[i] = start_position[i] + rate * h
         if start:
@@ -133,7 +146,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 base_euler_velocity[a + d] = v[d]
 
     @wp.kernel(module=module, enable_backward=False)
-    def keep_slope(
+    def add_slope(
+        share: scalar,
+        is_first: int,
         stage_size: wp.array(dtype=scalar),
         is_free: wp.array(dtype=int),
         solution: wp.array(dtype=vec3),
@@ -143,34 +158,19 @@ def define(variant: Variant) -> SimpleNamespace:
         slope: wp.array(dtype=vec3),
         euler_slope: wp.array(dtype=scalar),
     ):
-        """Keep the slope of a step's last stage; what is held has none."""
+        """Give a stage's slope to that of a step, in this share; is_first: none was given before. What is held has
+        none."""
         i = index(wp.tid())
-        slope[i] = vec3()
+        if is_first != 0:
+            slope[i] = vec3()
         if is_free[i] != 0:
-            slope[i] = (solution[i] - base_velocity[i]) / stage_size[0]
+            slope[i] = slope[i] + (solution[i] - base_velocity[i]) / stage_size[0] * share
         if wp.static(sliding):
             for s in range(2 * i, 2 * i + 2):
-                euler_slope[s] = (euler_solution[s] - base_euler_velocity[s]) / stage_size[0]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def extrapolate_slope(
-        stage_size: wp.array(dtype=scalar),
-        is_free: wp.array(dtype=int),
-        solution: wp.array(dtype=vec3),
-        euler_solution: wp.array(dtype=scalar),
-        base_velocity: wp.array(dtype=vec3),
-        base_euler_velocity: wp.array(dtype=scalar),
-        slope: wp.array(dtype=vec3),
-        euler_slope: wp.array(dtype=scalar),
-    ):
-        """Take the slope of a stage, and that of one which goes on from it, back to the start of the first."""
-        i = index(wp.tid())
-        two = scalar(2.0)
-        if is_free[i] != 0:
-            slope[i] = slope[i] * two - (solution[i] - base_velocity[i]) / stage_size[0]
-        if wp.static(sliding):
-            for s in range(2 * i, 2 * i + 2):
-                euler_slope[s] = two * euler_slope[s] - (euler_solution[s] - base_euler_velocity[s]) / stage_size[0]
+                if is_first != 0:
+                    euler_slope[s] = scalar(0.0)
+                of_stage = (euler_solution[s] - base_euler_velocity[s]) / stage_size[0]
+                euler_slope[s] = euler_slope[s] + of_stage * share
 
     @wp.kernel(module=module, enable_backward=False)
     def record_slope(
@@ -193,7 +193,6 @@ def define(variant: Variant) -> SimpleNamespace:
         ask_for_slope=ask_for_slope,
         enter_base=enter_base,
         enter_euler_base=enter_euler_base,
-        keep_slope=keep_slope,
-        extrapolate_slope=extrapolate_slope,
+        add_slope=add_slope,
         record_slope=record_slope,
     )

@@ -11,11 +11,13 @@ import warp as wp
 
 from ..core.indexing import index
 from ..core.variant import Variant
+from . import esdirk
 
 
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
+    row = esdirk.functions(variant).row
     module = variant.module("esdirk_adjoint")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -150,7 +152,7 @@ def define(variant: Variant) -> SimpleNamespace:
         base_velocity_grad: wp.array(dtype=vec3),
         base_euler_velocity_grad: wp.array(dtype=scalar),
     ):
-        """Reverse what a stage's slope gave to that of a step, in this share; is_whole: no other stage is to follow."""
+        """Reverse ``add_slope``; is_whole: of the stage that was the first to give."""
         i = index(wp.tid())
         by = share / stage_size[0]
         if is_free[i] != 0:
@@ -166,26 +168,6 @@ def define(variant: Variant) -> SimpleNamespace:
                 base_euler_velocity_grad[s] = base_euler_velocity_grad[s] - g_s
                 if is_whole != 0:
                     euler_slope_grad[s] = scalar(0.0)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def add_to_start(
-        base_position_grad: wp.array(dtype=vec3),
-        base_euler_grad: wp.array(dtype=scalar),
-        base_velocity_grad: wp.array(dtype=vec3),
-        base_euler_velocity_grad: wp.array(dtype=scalar),
-        start_position_grad: wp.array(dtype=vec3),
-        start_euler_grad: wp.array(dtype=scalar),
-        start_velocity_grad: wp.array(dtype=vec3),
-        start_euler_velocity_grad: wp.array(dtype=scalar),
-    ):
-        """Add the adjoints of a base that is the step's start to those of the start."""
-        i = index(wp.tid())
-        start_position_grad[i] = start_position_grad[i] + base_position_grad[i]
-        start_velocity_grad[i] = start_velocity_grad[i] + base_velocity_grad[i]
-        for s in range(2 * i, 2 * i + 2):
-            start_euler_grad[s] = start_euler_grad[s] + base_euler_grad[s]
-            if wp.static(sliding):
-                start_euler_velocity_grad[s] = start_euler_velocity_grad[s] + base_euler_velocity_grad[s]
 
     @wp.kernel(module=module, enable_backward=False)
     def hand_on(
@@ -210,28 +192,19 @@ def define(variant: Variant) -> SimpleNamespace:
         h = step_size[0]
         q = base_position_grad[i]
         v = base_velocity_grad[i]
-        of_explicit = tableau[0]
-        of_first = scalar(0.0)
-        of_second = scalar(0.0)
-        if stage == 1:
-            of_explicit = tableau[1]
-            of_first = tableau[2]
-        if stage == 2:
-            of_explicit = tableau[3]
-            of_first = tableau[4]
-            of_second = tableau[5]
+        a = row(stage, tableau)
         start_position_grad[i] = start_position_grad[i] + q
         over = h / stage_size[0]
         start_velocity_grad[i] = start_velocity_grad[i] + v
         if is_free[i] != 0:
-            start_velocity_grad[i] = start_velocity_grad[i] + q * (h * of_explicit)
-            slope_grad[i] = slope_grad[i] + v * (h * of_explicit)
+            start_velocity_grad[i] = start_velocity_grad[i] + q * (h * a[0])
+            slope_grad[i] = slope_grad[i] + v * (h * a[0])
         else:
-            solution_grad[i] = solution_grad[i] + q * (h * of_explicit)
-        first_solution_grad[i] = first_solution_grad[i] + (q * h + v * over) * of_first
-        first_base_grad[i] = first_base_grad[i] - v * (over * of_first)
-        second_solution_grad[i] = second_solution_grad[i] + (q * h + v * over) * of_second
-        second_base_grad[i] = second_base_grad[i] - v * (over * of_second)
+            solution_grad[i] = solution_grad[i] + q * (h * a[0])
+        first_solution_grad[i] = first_solution_grad[i] + (q * h + v * over) * a[1]
+        first_base_grad[i] = first_base_grad[i] - v * (over * a[1])
+        second_solution_grad[i] = second_solution_grad[i] + (q * h + v * over) * a[2]
+        second_base_grad[i] = second_base_grad[i] - v * (over * a[2])
 
     @wp.kernel(module=module, enable_backward=False)
     def hand_euler_on(
@@ -256,31 +229,21 @@ def define(variant: Variant) -> SimpleNamespace:
         start_euler_grad[s] = start_euler_grad[s] + q
         if wp.static(sliding):
             v = base_euler_velocity_grad[s]
-            of_explicit = tableau[0]
-            of_first = scalar(0.0)
-            of_second = scalar(0.0)
-            if stage == 1:
-                of_explicit = tableau[1]
-                of_first = tableau[2]
-            if stage == 2:
-                of_explicit = tableau[3]
-                of_first = tableau[4]
-                of_second = tableau[5]
+            a = row(stage, tableau)
             over = h / stage_size[0]
-            start_euler_velocity_grad[s] = start_euler_velocity_grad[s] + q * (h * of_explicit) + v
-            euler_slope_grad[s] = euler_slope_grad[s] + v * (h * of_explicit)
+            start_euler_velocity_grad[s] = start_euler_velocity_grad[s] + q * (h * a[0]) + v
+            euler_slope_grad[s] = euler_slope_grad[s] + v * (h * a[0])
             of_w = q * h + v * over
-            euler_first_solution_grad[s] = euler_first_solution_grad[s] + of_w * of_first
-            euler_first_base_grad[s] = euler_first_base_grad[s] - v * (over * of_first)
-            euler_second_solution_grad[s] = euler_second_solution_grad[s] + of_w * of_second
-            euler_second_base_grad[s] = euler_second_base_grad[s] - v * (over * of_second)
+            euler_first_solution_grad[s] = euler_first_solution_grad[s] + of_w * a[1]
+            euler_first_base_grad[s] = euler_first_base_grad[s] - v * (over * a[1])
+            euler_second_solution_grad[s] = euler_second_solution_grad[s] + of_w * a[2]
+            euler_second_base_grad[s] = euler_second_base_grad[s] - v * (over * a[2])
 
     return SimpleNamespace(
         restore_slope=restore_slope,
         restore_stages=restore_stages,
         restore_euler_stages=restore_euler_stages,
         slope_adjoint=slope_adjoint,
-        add_to_start=add_to_start,
         hand_on=hand_on,
         hand_euler_on=hand_euler_on,
     )

@@ -12,8 +12,9 @@ import warp as wp
 from ..device import declarations
 from ..device.energy_watch import AT_SLOPE, AT_START
 from ..device.model import Model
-from .explicit_adjoint import ExplicitAdjoint
+from .explicit_adjoint import SOLUTIONS, ExplicitAdjoint
 from .stage import StageMethod
+from .stage_solve import STATE
 
 GAMMA = 0.43586652150845899942
 """The root of γ³ − 3 γ² + 3/2 γ − 1/6 for which methods of three implicit stages are L-stable."""
@@ -101,10 +102,8 @@ class ESDIRK3(StageMethod):
             self.enter_base(stage, start=a["solution"])
             self.newton.solve(stage)
             model.energy.add_work(stage)
-            if stage == 0:
-                model.copy(first_solution="solution", euler_first_solution="euler_solution")
-            elif stage == 1:
-                model.copy(second_solution="solution", euler_second_solution="euler_solution")
+            if stage < len(SOLUTIONS):
+                self._keep_solution(stage)
         self._end()
 
     def find_slope(self) -> None:
@@ -114,21 +113,28 @@ class ESDIRK3(StageMethod):
         self.enter_slope_stage()
         self.newton.solve(0)
         model.energy.add_work(SLOPES[0])
-        model.copy(first_solution="solution", euler_first_solution="euler_solution")
-        model.launch("keep_slope", "nodes")
+        self._keep_solution(0)
+        model.launch("add_slope", "nodes", share=2.0, is_first=1)
         model.inputs.load()
         self.set_base()
         self.newton.solve(1)
         model.energy.add_work(SLOPES[1])
-        model.copy(second_solution="solution", euler_second_solution="euler_solution")
-        model.launch("extrapolate_slope", "nodes")
+        self._keep_solution(1)
+        model.launch("add_slope", "nodes", share=-1.0, is_first=0)
+
+    def _keep_solution(self, stage: int) -> None:
+        """Keeps w of one of the first two stages."""
+        name = SOLUTIONS[stage][0]
+        self.model.copy(**{name: "solution", f"euler_{name}": "euler_solution"})
 
     def _add_work_of_slope(self) -> None:
         """Adds the work of the explicit stage, at the step's start."""
-        if self.model.inputs.move:
-            self.model.inputs.load(AT_START)
-        self.model.energy.add_work(START)
-        self.model.inputs.load()
+        model = self.model
+        if model.inputs.move:
+            model.inputs.load(AT_START)
+        model.energy.add_work(START)
+        if model.inputs.move:
+            model.inputs.load()
 
     def enter_slope_stage(self) -> None:
         """Starts a stage from the present state."""
@@ -137,7 +143,7 @@ class ESDIRK3(StageMethod):
 
     def keep_start(self) -> None:
         """Keeps the state that the step starts from."""
-        self.model.copy(**{f"start_{name}": name for name in declarations.STATE if name != "anchor"})
+        self.model.copy(**{f"start_{name}": name for name in STATE})
 
     def enter_base(self, stage: int, **start: Any) -> None:
         """Places what a stage starts from."""

@@ -10,8 +10,9 @@ import numpy as np
 from ..device import declarations
 from ..device.energy_watch import AT_SLOPE
 from .stage_adjoint import StageAdjoint
+from .stage_solve import STATE
 
-STARTS = ("start_position", "start_euler", "start_velocity", "start_euler_velocity")
+STARTS = tuple(f"start_{name}" for name in STATE)
 SOLUTIONS = (("first_solution", "first_base"), ("second_solution", "second_base"))
 """w of the first two implicit stages, and what they start from."""
 
@@ -59,7 +60,7 @@ class ExplicitAdjoint(StageAdjoint):
         before()
         model.launch("count", 1, by=-1)
         model.launch("restore_slope", "nodes")
-        model.copy(**{f"base_{name}_grad": f"{name}_grad" for name in declarations.STATE if name != "anchor"})
+        model.copy(**{f"base_{name}_grad": f"{name}_grad" for name in STATE})
         a.zero_grad("solution", *STARTS, *self._kept)
 
     def _restore_frame(self) -> None:
@@ -106,8 +107,13 @@ class ExplicitAdjoint(StageAdjoint):
 
     def _leave_slope(self) -> None:
         """Leaves it to where the step started."""
+        a = self.model.arrays
         _, after = self.around
-        self.model.launch("add_to_start", "nodes")
+        # what is added to the base elsewhere is its own here
+        given = {"position": "position", "euler": "euler", "increment": "velocity", "euler_increment": "euler_velocity"}
+        added = {f"{name}_grad": a.find(f"base_{of}_grad") for name, of in given.items()}
+        to = {f"base_{name}_grad": a.find(f"start_{name}_grad") for name in STATE}
+        self.model.launch("add_stage_adjoint", "nodes", **added, **to)
         after(AT_SLOPE)
 
     def _enter_stage(self, stage: int) -> None:
@@ -136,7 +142,7 @@ class ExplicitAdjoint(StageAdjoint):
 
     def _hand_back(self) -> None:
         """Makes the adjoints of the step's start those of the base."""
-        self.model.copy(**{f"base_{name.removeprefix('start_')}_grad": f"{name}_grad" for name in STARTS})
+        self.model.copy(**{f"base_{name}_grad": f"start_{name}_grad" for name in STATE})
 
     def _finish(self) -> None:
         self._hand_back()

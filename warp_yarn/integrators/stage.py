@@ -79,7 +79,7 @@ class StageMethod:
     def _end(self) -> None:
         """Ends a step, with what the next one asks of it."""
         if "slopes" in self.model.arrays.conditions:
-            self.model.launch("keep_slope", "nodes")
+            self.model.launch("add_slope", "nodes", share=1.0, is_first=1)
         self.model.end_step(by_stages=True)
 
     @property

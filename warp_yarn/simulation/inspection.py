@@ -253,7 +253,7 @@ class Visit:
             model.inputs.evaluate(self.row, stepper.frames.state().position if begun is None else begun)
         if not self.by_stages:
             # before the first step, pins are where they start
-            model.arrays.put("stage_times", *[float(self.ahead or stepper.steps_done > 0)] * 6)
+            model.arrays["stage_times"].fill_(float(self.ahead or stepper.steps_done > 0))
             model.inputs.load()
         if self.visited is not None:
             stepper.frames.upload(self.visited)

@@ -153,7 +153,7 @@ class Relaxation:
         done = self.stepper.steps_done
         method.set_times(size, size)
         # pins and forces stay where the last step has brought them; before the first one, where they start
-        self.arrays.put("stage_times", *[float(done > 0)] * 6)
+        self.arrays["stage_times"].fill_(float(done > 0))
         self.arrays.put("counters", 0, max(0, done - 1))
         if self.model.inputs.functions:
             self.model.inputs.evaluate(max(0, done - 1), self.frames.state().position)
