@@ -85,9 +85,18 @@ def define(variant: Variant) -> SimpleNamespace:
         energy. (Of A − G it might be less.) What it leaves is taken from the contraction.
         """
         norm = wp.sqrt(wp.max(control.directional_derivative[0], control.kinetic_left[0]))
+        # not of the first δ, of which the line search may take little
+        change = wp.sqrt(control.kinetic[0])
+        if stage == 0:
+            control.first_change[0] = change
+        else:
+            change = wp.max(change, control.first_change[0])
+        control.change[0] = change
         left = scalar(CONTRACTION_SAFETY)
         if control.steps[0] > 0:
-            control.contraction[0] = wp.max(norm / control.last_norm[0], scalar(LEAST_CONTRACTION))
+            # of a first step that stretches yarns, more is taken away at once than by those after it
+            before = wp.max(wp.min(control.last_norm[0], change), scalar(1.0e-30))
+            control.contraction[0] = wp.max(norm / before, scalar(LEAST_CONTRACTION))
             left *= control.contraction[0]
         elif stage == 0:
             # not known of a time step's first
@@ -95,25 +104,19 @@ def define(variant: Variant) -> SimpleNamespace:
         else:
             # that of the stage before, whose matrix this one begins with
             left *= control.contraction[0] * scalar(CONTRACTION_SAFETY)
-        # not of the first δ, of which the line search may take little
-        control.change[0] = wp.sqrt(control.kinetic[0])
-        if stage == 0:
-            control.first_change[0] = control.change[0]
-        else:
-            control.change[0] = wp.max(control.change[0], control.first_change[0])
         control.steps[0] = control.steps[0] + 1
         control.last_norm[0] = norm
         control.newton_iterations[0] = control.newton_iterations[0] + 1
         if status[0] == 0:
-            residual[0] = norm / wp.max(control.change[0], scalar(1.0e-30))
+            residual[0] = norm / wp.max(change, scalar(1.0e-30))
         control.take_unchecked_step[0] = 0
-        small = left < scalar(1.0) and left * norm <= control.newton_tolerance[0] * control.change[0]
+        least = control.newton_tolerance[0] * change
+        small = left < scalar(1.0) and left * norm <= least
         rest = scalar(1.0) - control.contraction[0]
         if control.steps[0] > 1 and rest > scalar(wp.static(1.0 - STEADY_CONTRACTION)):
-            small = small or left * norm <= rest * control.newton_tolerance[0] * control.change[0]
+            small = small or left * norm <= rest * least
         if norm == scalar(0.0) or (control.step_length[0] == scalar(1.0) and small):
             control.take_unchecked_step[0] = 1
-        least = control.newton_tolerance[0] * control.change[0]
         if -control.directional_derivative[0] > least * least and status[0] == 0:
             # a direction along which r does not fall: the linear solve has no digit right
             status[0] = wp.static(STALLED)

@@ -28,6 +28,7 @@ class Newton:
 
     def __init__(self, model: Model, *, has_fallback: bool):
         self.model, self.has_fallback = model, has_fallback
+        self._is_held = len(model.scene.pins) > 0
         a = model.arrays
         a.make(declarations.STAGES)
         self.compression = Compression(model)
@@ -36,7 +37,7 @@ class Newton:
             a.put("unit", 1.0)
             a.put("step_length", 1.0)
             a.put("shortest", 1e30)
-            a.put("inner_tolerance", INNER_TOLERANCE if len(model.scene.pins) else INNER_TOLERANCE_FREE)
+            a.put("inner_tolerance", INNER_TOLERANCE if self._is_held else INNER_TOLERANCE_FREE)
 
     def evaluate(self, *, matrix: bool) -> None:
         """Computes the residual at w, and the matrix if asked for."""
@@ -119,7 +120,7 @@ class Newton:
         self.compression.solve(self._solve_linear)
         self.compression.forget()
         a.zero("asks_for_compression")
-        self.model.launch("begin_line_search", 1)
+        self.model.launch("begin_line_search", 1, is_held=int(self._is_held))
         if self.model.scene.sliding:
             self.model.launch("limit_step_length", "segments")
         self.model.contact.limit_step()
@@ -128,6 +129,6 @@ class Newton:
     def _solve_linear(self) -> None:
         a = self.model.arrays
         a.zero("direction", "euler_direction")
-        if not len(self.model.scene.pins):
+        if not self._is_held:
             self.model.launch("start_rigid", 1)
         self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])

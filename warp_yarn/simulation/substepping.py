@@ -16,7 +16,7 @@ from ..device.model import Model
 from ..kernels.core.status import CROWDED, GAINED, IMPACT, INACCURATE
 from ..moved import renamed, renamed_attribute
 
-SMALLEST = 2.0**-7
+SMALLEST = 2.0**-10
 """Of a step, where a part is halved because it cannot be made."""
 SMALLEST_CONTROLLED = 2.0**-14
 """Of a step, where parts follow the error: a step is then what lies between two frames, and may be long."""
