@@ -1,6 +1,6 @@
 """The default tolerances on random scenes: whether they add to a step's own error, and whether anything fails or gains.
 
-    python benchmarks/defaults.py [--scenes 60] [--first 0] [--integrator sdirk2]
+    python benchmarks/defaults.py [--scenes 180] [--first 0] [--integrator sdirk2]
 
 A scene is known by its number, which seeds all of it: a fabric, a weave, 4 to 9 yarns each way, Y × 0.01 to × 1e4, a
 step of 0.1 ms to 1/24 s, 8 to 20 of them, sliding or not, and a motion: free (let go strained), thrown (spinning, at
@@ -262,7 +262,7 @@ def compare(case: Case, integrator: str = "sdirk2", newton_tolerance: float | No
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=60, help="(%(default)s)")
+    parser.add_argument("--scenes", type=int, default=180, help="(%(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene (%(default)s)")
     parser.add_argument("--integrator", default="sdirk2", help="(%(default)s)")
     parser.add_argument("--newton-tolerance", type=float, help="in place of the default's")

@@ -206,14 +206,9 @@ def test_crossings_never_change_their_order(method: str, terms: list[str]) -> No
     rates[5, 0], rates[6, 0] = 0.2, -0.2
     simulator = wy.Simulator(wy.Scene(fabric, gravity=None, terms=terms), integrator=method)
     simulator.state = wy.State(fabric.position, fabric.euler, np.zeros((fabric.nodes, 3)), rates)
-    if method == "esdirk3" and not terms:
-        # without forces M alone, which is singular, turns them round
-        trajectory = simulator.run(20)
-    else:
-        with pytest.raises(wy.SimulationError) as error:
-            simulator.run(20)
-        trajectory = error.value.trajectory
-    euler = trajectory.euler.reshape(-1, 4, 4, 2)
+    with pytest.raises(wy.SimulationError) as error:
+        simulator.run(20)
+    euler = error.value.trajectory.euler.reshape(-1, 4, 4, 2)
     assert np.diff(euler[..., 0], axis=2).min() > 0.0 and np.diff(euler[..., 1], axis=1).min() > 0.0
 
 
@@ -309,7 +304,7 @@ def test_a_stage_that_does_not_converge_stops_the_run() -> None:
     simulator = wy.Simulator(wy.Scene(scene.cloth, terms=["inertia"]))
     simulator.state = state
     with pytest.raises(
-        wy.SimulationError, match=r"(Newton's iteration stopped|gains energy) .* parts as small as 7\.8e-06 s"
+        wy.SimulationError, match=r"(Newton's iteration stopped|gains energy) .* parts as small as 9\.8e-07 s"
     ) as error:
         simulator.run(2)
     assert len(error.value.trajectory) == error.value.step == 1

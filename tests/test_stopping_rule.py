@@ -8,6 +8,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from internals import newton_tolerance
 
 import warp_yarn as wy
 from warp_yarn.description.cloth import CLOTH_NUMBERS
@@ -53,7 +54,7 @@ def test_a_step_leaves_no_more_than_its_tolerance(fabric, stretch, step):
                 change -= change.mean(axis=0)
             left = by_default.state.velocity - tight.state.velocity
             # two stages have each their tolerance
-            assert norm(left) <= 2.0 * by_default.model.newton_tolerance_at(step) * norm(change)
+            assert norm(left) <= 2.0 * newton_tolerance(by_default, step) * norm(change)
 
 
 @pytest.mark.parametrize("sliding", [False, True])

@@ -79,7 +79,8 @@ class Simulator(Loads, Filming):
             P the preconditioner; None: 1e-6, and 1e-8 where differentiable; in single precision 1e-4. In implicit
             stages it is that of the adjoint's solves alone.
         newton_tolerance: of an implicit stage: what is left of the velocities to find, relative to their change in the
-            step, as √ of kinetic energies (``docs/solver.md``); None: 2e-2, less where the step resolves the yarns'
+            step (beside the mass centre's, of a cloth that nothing holds), as √ of kinetic energies
+            (``docs/solver.md``); None: 2e-2, less where the step resolves the yarns'
             stretching, as its square, and where yarns are stiff, down to 2e-5, in
             single precision 2e-3; and 1e-8 where differentiable.
         max_iterations: of the conjugate gradient, from 1 to 2³¹ − 1; None: as many as there are degrees of freedom, and
