@@ -1,4 +1,4 @@
-"""When Newton's iteration stops: what a stage leaves is within the tolerance, whatever the cloth and its motion.
+"""When Newton's iteration stops: what a stage leaves is within the tolerance, of stiff and soft cloth, free and held.
 
 Both are seen at default settings, where yarns are let go strained: there stretching is taken away at once, and buckling
 goes on.

@@ -10,6 +10,7 @@ from ..core.memory import functions as access
 from ..core.status import ORDER_LOST, fail
 from ..core.structs import structs
 from ..core.variant import Variant
+from .newton import is_held
 
 LEAST_LEFT = 0.1
 """Part of a Δs that a step of the iteration leaves of it at least."""
@@ -18,7 +19,7 @@ LEAST_EXTRAPOLATED = 0.5
 where crossings fly at each other, the second stage would begin inside the barrier, and gain several times the energy
 of the start."""
 
-LEAST_INNER = {wp.float64: 1e-5, wp.float32: 1e-3}
+LEAST_INNER = {wp.float64: 1e-4, wp.float32: 0.1}
 """The least change of velocity, beside that of the mass center, that a free cloth's is taken for: rounding."""
 
 
@@ -51,7 +52,7 @@ def define(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def begin_line_search(
         nodes: int,
-        is_held: int,
+        held_by: int,
         touching: wp.array(dtype=int),
         node_mass: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
@@ -95,7 +96,7 @@ def define(variant: Variant) -> SimpleNamespace:
             impulse += gain * m
             square += m * (wp.dot(gain, gain) + along)
             left += m * (wp.dot(d, d) + along_left)
-        if is_held == 0 and touching[0] == 0:
+        if not is_held(held_by, touching):
             least = square * scalar(wp.static(LEAST_INNER[scalar] ** 2))
             square = wp.max(square - wp.dot(impulse, impulse) / mass, least)
         control.directional_derivative[0] = total

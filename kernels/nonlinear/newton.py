@@ -18,6 +18,8 @@ from ..core.status import NOT_FINITE, STALLED
 from ..core.structs import structs
 from ..core.variant import Variant
 
+NOTHING, OBSTACLES, PINS = 0, 1, 2
+"""What may hold a cloth; obstacles hold it where it touches them."""
 MOST_EVALUATIONS = 200
 """Evaluations in a stage. Newton's iteration takes 2 or 3 in ordinary motion; A leaves out what is not symmetric, so
 that violent sliding brings them to dozens."""
@@ -43,6 +45,12 @@ POSITION_ROUNDING = {wp.float64: 1e-15, wp.float32: 5e-7}
 """A few units in the last place."""
 
 
+@wp.func
+def is_held(held_by: int, touching: wp.array(dtype=int)) -> bool:
+    """Tell whether anything keeps the mass centre of all cloth from moving as outer forces have it."""
+    return held_by == wp.static(PINS) or (held_by == wp.static(OBSTACLES) and touching[0] != 0)
+
+
 @functools.cache
 def define(variant: Variant) -> SimpleNamespace:
     scalar, vec3, sliding = variant.scalar, variant.vec3, variant.sliding
@@ -53,15 +61,15 @@ def define(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def start_rigid(
         nodes: int,
-        node_mass: wp.array(dtype=scalar),
+        held_by: int,
         touching: wp.array(dtype=int),
+        node_mass: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
     ):
         """Start δ as that of a free cloth that moves as one: the solver need not find how it falls, to its
         tolerance."""
-        if touching[0] != 0:
-            # what it touches does not let it
+        if is_held(held_by, touching):
             return
         momentum = vec3()
         mass = scalar(0.0)
@@ -95,7 +103,11 @@ def define(variant: Variant) -> SimpleNamespace:
         left = scalar(CONTRACTION_SAFETY)
         if control.steps[0] > 0:
             # of a first step that stretches yarns, more is taken away at once than by those after it
-            before = wp.max(wp.min(control.last_norm[0], change), scalar(1.0e-30))
+            before = control.last_norm[0]
+            if control.steps[0] > 1:
+                # a step that went astray is large, and the one after it no nearer to the end than the one before
+                before /= wp.max(control.contraction[0], scalar(1.0))
+            before = wp.max(wp.min(before, change), scalar(1.0e-30))
             control.contraction[0] = wp.max(norm / before, scalar(LEAST_CONTRACTION))
             left *= control.contraction[0]
         elif stage == 0:

@@ -316,7 +316,7 @@ LAUNCH: Group = {
     "matrix": Field("launch", 1, "int", "", "always", "whether a term is to fill the matrix"),
     "add_contact_load": Field("launch", 1, "int", "", "always", "whether a term is to add to ``contact_load``"),
     "stage": Field("launch", 1, "int", "", "always", "which stage of the step, from 0"),
-    "is_held": Field("launch", 1, "int", "", "always", "whether there are pins"),
+    "held_by": Field("launch", 1, "int", "", "always", "0 nothing, 1 obstacles that are touched, 2 pins"),
     "along": Field("launch", 1, "int", "", "always", "direction of lines: 0 warp, 1 weft"),
     "first": Field("launch", 1, "int", "", "always", "first node of a level"),
     "count": Field("launch", 1, "int", "", "always", "nodes of a level"),

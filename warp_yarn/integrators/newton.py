@@ -6,6 +6,7 @@ import warp as wp
 
 from ..device import declarations
 from ..device.model import Model
+from ..kernels.nonlinear.newton import NOTHING, OBSTACLES, PINS
 from .compression import Compression
 
 INNER_TOLERANCE = 1e-2
@@ -28,7 +29,8 @@ class Newton:
 
     def __init__(self, model: Model, *, has_fallback: bool):
         self.model, self.has_fallback = model, has_fallback
-        self._is_held = len(model.scene.pins) > 0
+        scene = model.scene
+        self._held_by = PINS if len(scene.pins) else OBSTACLES if scene.obstacles else NOTHING
         a = model.arrays
         a.make(declarations.STAGES)
         self.compression = Compression(model)
@@ -37,7 +39,7 @@ class Newton:
             a.put("unit", 1.0)
             a.put("step_length", 1.0)
             a.put("shortest", 1e30)
-            a.put("inner_tolerance", INNER_TOLERANCE if self._is_held else INNER_TOLERANCE_FREE)
+            a.put("inner_tolerance", INNER_TOLERANCE if self._held_by == PINS else INNER_TOLERANCE_FREE)
 
     def evaluate(self, *, matrix: bool) -> None:
         """Computes the residual at w, and the matrix if asked for."""
@@ -120,7 +122,7 @@ class Newton:
         self.compression.solve(self._solve_linear)
         self.compression.forget()
         a.zero("asks_for_compression")
-        self.model.launch("begin_line_search", 1, is_held=int(self._is_held))
+        self.model.launch("begin_line_search", 1, held_by=self._held_by)
         if self.model.scene.sliding:
             self.model.launch("limit_step_length", "segments")
         self.model.contact.limit_step()
@@ -129,6 +131,6 @@ class Newton:
     def _solve_linear(self) -> None:
         a = self.model.arrays
         a.zero("direction", "euler_direction")
-        if not self._is_held:
-            self.model.launch("start_rigid", 1)
+        if self._held_by != PINS:
+            self.model.launch("start_rigid", 1, held_by=self._held_by)
         self.model.solve(tolerance=a["inner_tolerance"], solution=a["direction"], euler_solution=a["euler_direction"])

@@ -16,8 +16,8 @@ from ..device.model import Model
 from ..kernels.core.status import CROWDED, GAINED, IMPACT, INACCURATE
 from ..moved import renamed, renamed_attribute
 
-SMALLEST = 2.0**-10
-"""Of a step, where a part is halved because it cannot be made."""
+SMALLEST = {"double": 2.0**-10, "single": 2.0**-7}
+"""Of a step, where a part is halved because it cannot be made. In single precision rounding ends shorter ones."""
 SMALLEST_CONTROLLED = 2.0**-14
 """Of a step, where parts follow the error: a step is then what lies between two frames, and may be long."""
 SAFETY = 0.9
@@ -87,7 +87,7 @@ class Substepping:
         done, smallest = 0.0, 1.0
         # what a rejected part has put by is put back, but an account that it opened
         self._graphs.run("open", self.model.begin_step)
-        least = SMALLEST if self.allowed is None else SMALLEST_CONTROLLED
+        least = SMALLEST[self.model.precision] if self.allowed is None else SMALLEST_CONTROLLED
         while done < 1.0:
             left = 1.0 - done
             # as many of one size as fit; rounding is not to add another
