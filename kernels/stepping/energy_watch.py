@@ -2,12 +2,12 @@
 
     T + V_stretch + V_pins + V_gravity  ≤  E + W + g × what there is of it beside gravity
 
-E is the whole energy at the last audit, all terms' energies at the beginning of a step, which is made every
-``EVERY`` steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken
-for a gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a
-while after. W is the work of wind, applied forces and moving pins since. The same must hold from the run's start on.
-A method of stages has of that work what its stages say: where air or a spring takes a light cloth along within a step,
-the power at the step's ends says nothing of it.
+E is the whole energy at the last audit, all terms' energies at the beginning of a step, which is made every ``EVERY``
+steps: between audits only the cheap terms are added up, and the others count as 0, so that no energy is taken for a
+gain that one of them releases. They are added up too where yarns give or take much energy in a step, and for a while
+after; then the end of a step is as good as an audit, and E is what it leaves. W is the work of wind, applied forces and
+moving pins since. The same must hold from the run's start on. A method of stages has of that work what its stages say:
+where air or a spring takes a light cloth along within a step, the power at the step's ends says nothing of it.
 
 g is ``GAIN``: what gains more is made again, damped, in parts, or ends the run, for it would be wrong without saying
 so, or blow up. It is ``BLOW_UP`` of methods that have no stages, and of runs that must have a gradient, whose loss
@@ -156,6 +156,7 @@ def define(variant: Variant) -> SimpleNamespace:
         bounds: wp.array(dtype=scalar),
         damps: wp.array(dtype=int),
         alert: wp.array(dtype=int),
+        looks_closely: wp.array(dtype=int),
         steps_to_audit: wp.array(dtype=int),
         audit_due: wp.array(dtype=int),
         status: wp.array(dtype=int),
@@ -193,6 +194,9 @@ def define(variant: Variant) -> SimpleNamespace:
                 bounds[6] = wp.where(dissipated, inner, most * scalar(wp.static(1.0 - 1.0 / FORGET)))
                 bounds[0] += work
                 bounds[1] += work
+                if looks_closely[0] != 0:
+                    # all terms are added up, as at an audit
+                    bounds[0] = wp.min(bounds[0], total)
                 bounds[3] = power[0]
                 bounds[4] = elastic_energy[0]
                 bounds[5] = inner
