@@ -24,7 +24,7 @@ START, SLOPES = 3, (4, 5)
 """The places of the explicit stage among ``stage_shares``, and of the two stages that find its slope."""
 
 OF_TOLERANCE = 0.1
-"""Of the default tolerance of other methods, as its steps are so much less off: on the sixty random scenes of
+"""Of the default tolerance of other methods, as its steps are so much less off: on the random scenes of
 ``benchmarks/defaults.py`` that costs a tenth, and errors of stiff cloth halve."""
 
 
