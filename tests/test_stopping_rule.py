@@ -99,7 +99,7 @@ def test_cloths_that_touch_each_other_alone_move_as_ones_that_float():
     n, spacing = cloth.nodes, cloth.spacing
     alone = wy.Simulator(wy.Scene(cloth, self_contact=True))
     distance, reach = (float(numbers(alone, f"self_contact_{name}")[0]) for name in ("distance", "range"))
-    above = cloth.replace(pose=cloth.position + (0.2 * spacing, 0.1 * spacing, distance + 0.9 * reach))
+    above = cloth.replace(pose=cloth.position + np.array([0.2 * spacing, 0.1 * spacing, distance + 0.9 * reach]))
     press = {node: (0.0, 0.0, 2e-6 if node < n else -2e-6) for node in range(2 * n)}
     seen = []
     for gravity in None, (0.0, 0.0, -9.8):
