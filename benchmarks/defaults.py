@@ -36,7 +36,6 @@ import warp as wp
 from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn.description.cloth import CLOTH_NUMBERS
 from warp_yarn.device.defaults import stretch_rate
 from warp_yarn.presets.fabrics import STUDIED
 
@@ -99,8 +98,7 @@ class Case:
         """Make the cloth, of yarns that are as much stiffer."""
         cloth = STUDIED[self.fabric](rows=self.rows, columns=self.columns, weave=self.weave)
         yarns = [dataclasses.replace(yarn, stretch=self.stretch * yarn.stretch) for yarn in cloth.yarns]
-        numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
-        return wy.Cloth(cloth.weave, yarns=yarns, pose="upright" if self.number % 2 else "flat", **numbers)
+        return cloth.replace(yarns=yarns, pose="upright" if self.number % 2 else "flat")
 
     def scene(self, finer: int = 1) -> wy.Scene:
         """Make the scene, for steps that are so many times shorter."""

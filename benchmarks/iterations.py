@@ -30,7 +30,6 @@ import warp as wp
 from common import RESULTS, environment, print_table, write_csv
 
 import warp_yarn as wy
-from warp_yarn.description.cloth import CLOTH_NUMBERS
 from warp_yarn.device.model import SOLVED
 from warp_yarn.presets.fabrics import STUDIED
 
@@ -51,8 +50,7 @@ def cloth_of(fabric: str, size: int, stretch: float = 1.0) -> wy.Cloth:
     """Make a flat cloth, of yarns that are as much stiffer."""
     cloth = STUDIED[fabric](rows=size, columns=size, pose="flat")
     yarns = [dataclasses.replace(yarn, stretch=stretch * yarn.stretch) for yarn in cloth.yarns]
-    numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
-    return wy.Cloth(cloth.weave, yarns=yarns, pose="flat", **numbers)
+    return cloth.replace(yarns=yarns)
 
 
 def hung(cloth: wy.Cloth) -> wy.State:

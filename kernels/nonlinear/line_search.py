@@ -20,7 +20,7 @@ where crossings fly at each other, the second stage would begin inside the barri
 of the start."""
 
 LEAST_INNER = {wp.float64: 1e-4, wp.float32: 0.1}
-"""The least change of velocity, beside that of the mass center, that a free cloth's is taken for: rounding."""
+"""The least change of velocity, beside that of the mass centre, that a free cloth's is taken for: rounding."""
 
 
 @functools.cache

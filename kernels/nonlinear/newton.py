@@ -102,11 +102,11 @@ def define(variant: Variant) -> SimpleNamespace:
         control.change[0] = change
         left = scalar(CONTRACTION_SAFETY)
         if control.steps[0] > 0:
-            # of a first step that stretches yarns, more is taken away at once than by those after it
             before = control.last_norm[0]
             if control.steps[0] > 1:
                 # a step that went astray is large, and the one after it no nearer to the end than the one before
                 before /= wp.max(control.contraction[0], scalar(1.0))
+            # of a first step that stretches yarns, more is taken away at once than by those after it
             before = wp.max(wp.min(before, change), scalar(1.0e-30))
             control.contraction[0] = wp.max(norm / before, scalar(LEAST_CONTRACTION))
             left *= control.contraction[0]

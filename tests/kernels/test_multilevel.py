@@ -11,7 +11,6 @@ import pytest
 from cases import make_state
 
 import warp_yarn as wy
-from warp_yarn.description.cloth import CLOTH_NUMBERS
 from warp_yarn.device import defaults
 from warp_yarn.device.threads import SOLVED
 from warp_yarn.presets.fabrics import FABRICS
@@ -344,8 +343,7 @@ def stiff(factor: float, rows: int, columns: int) -> wy.Cloth:
     """Make the paper's cloth with yarns that are as much stiffer."""
     cloth = FABRICS["paper"](rows=rows, columns=columns, pose="flat")
     yarns = [dataclasses.replace(yarn, stretch=factor * yarn.stretch) for yarn in cloth.yarns]
-    numbers = {name: getattr(cloth, name) for name in CLOTH_NUMBERS}
-    return wy.Cloth(cloth.weave, yarns=yarns, pose="flat", **numbers)
+    return cloth.replace(yarns=yarns)
 
 
 @pytest.mark.parametrize("sliding", [False, True])

@@ -80,9 +80,8 @@ class Simulator(Loads, Filming):
             stages it is that of the adjoint's solves alone.
         newton_tolerance: of an implicit stage: what is left of the velocities to find, relative to their change in the
             step (beside the mass centre's, of a cloth that nothing holds), as √ of kinetic energies
-            (``docs/solver.md``); None: 2e-2, less where the step resolves the yarns'
-            stretching, as its square, and where yarns are stiff, down to 2e-5, in
-            single precision 2e-3; and 1e-8 where differentiable.
+            (``docs/solver.md``); None: 2e-2, less where the step resolves the yarns' stretching, as its square, and
+            where yarns are stiff, down to 2e-5, in single precision 2e-3; and 1e-8 where differentiable.
         max_iterations: of the conjugate gradient, from 1 to 2³¹ − 1; None: as many as there are degrees of freedom, and
             1000 at least.
         threads: processor cores for the linear solves of a cloth; they wait for each other by spinning, so no more than
